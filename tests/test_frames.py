@@ -146,6 +146,17 @@ def test_a_stream_navigates(drive):
     assert stream.latest is not None and stream.latest.t > drive["imu"]["t"].iloc[-1] - 2
 
 
+def test_a_stream_takes_the_sensors_that_are_named():
+    stream = dlkf.Stream("plus", aids=["speed"])
+    assert stream.speed(1.0, 5.0).status == "taken" and stream.heading(1.0, 0.5).status == "refused"
+    with pytest.raises(dlkf.InputError, match="model=mbkf15 has no vehicle constraints and takes no speed"):
+        dlkf.Stream("mbkf15", aids=["speed"])
+    with pytest.raises(dlkf.InputError, match="unknown 'sped'; did you mean speed"):
+        dlkf.Stream("plus", aids=["sped"])
+    with pytest.raises(dlkf.InputError, match="leaves out speed, which model="):
+        dlkf.Stream("mbkf21_car+speed", aids=["heading"])
+
+
 WRONG = {
     "no frame": (lambda d: (d["imu"].to_numpy(), d["gnss"]), {}, "imu is a ndarray, must be a pandas DataFrame"),
     "a column": (lambda d: (d["imu"].drop(columns="gyro_x"), d["gnss"]), {}, "column gyro_x missing"),

@@ -17,10 +17,10 @@ from dlkf.base.files import is_url, require_empty, write_into
 from dlkf.base.provenance import describe_provenance
 from dlkf.command import command, list_typed_words
 from dlkf.command.settings import ExportSettings
-from dlkf.data.aid_tables import standard_tables
 from dlkf.data.store import drive_from_tables, drive_rows
 from dlkf.data.validate import read_drive
-from dlkf.filters.aids.attach import find_tables, with_aids
+from dlkf.filters.aids.attach import add_chosen_aids, find_tables
+from dlkf.filters.card import describe_slow_drives
 from dlkf.filters.saved import choose_grid
 from dlkf.filters.smoother import SmoothedSolution
 from dlkf.onboard.c_source import EXAMPLES, write_source
@@ -45,11 +45,14 @@ def main(settings: ExportSettings) -> None:
     model = resolve_model(str(settings.model), imu, settings.tracking.uri, **settings.filter_options)
     if line := unused_settings(str(settings.model), list_typed_words("imu", "tuning")):
         print(line)
-    aids = [settings.aids] if isinstance(settings.aids, str) else list(settings.aids or ())
-    model = with_aids(model, standard_tables(aids))
     if isinstance(model, SmoothedSolution):
         raise InputError(f"model={settings.model} looks ahead, which a vehicle cannot; take it without _rts")
+    name = short_name(settings.model)
+    if settings.aids is not None:
+        model = add_chosen_aids(name, model, settings.aids)
     given = choose_grid([model], settings.rate_hz, settings.epoch_s)
+    for line in describe_slow_drives({name: model}, [given["rate_hz"]], "this export has"):
+        print(line)
     dtype = {"double": torch.float64, "float": torch.float32}[settings.precision]
     grid = Grid(round(given["rate_hz"] * given["epoch_s"]), 1 / given["rate_hz"], dtype)
     with write_into(settings.out) as folder, tempfile.TemporaryDirectory() as somewhere:
@@ -61,7 +64,7 @@ def main(settings: ExportSettings) -> None:
             dataset = simulate_dataset(drive, imu, 0, Path(somewhere) / "check", progress=False, workers=1)
         tables = read_drive(dataset, drive_rows(dataset, settings.drive)[0], reference=False)
         drive = drive_from_tables(tables, "", given["rate_hz"], given["epoch_s"], torch.float64, find_tables(model))
-        layout = write_source(folder, model, grid, short_name(settings.model), describe_provenance())
+        layout = write_source(folder, model, grid, name, describe_provenance())
         for name in COPIED:
             (folder / name).write_text((EXAMPLES / name).read_text())
         write_log(folder / "drive.csv", tables)
@@ -70,7 +73,7 @@ def main(settings: ExportSettings) -> None:
         else:
             lines = check_export(Path(somewhere), folder, model, grid, layout, tables, drive, settings.latency)
     arm = " ".join(f"{x:g}" for x in tables.row.lever_arm_b)
-    print(f"{short_name(settings.model)} as C in {settings.out}: dlkf.h describes the calls")
+    print(f"{name} as C in {settings.out}: dlkf.h describes the calls")
     print("\n".join(lines))
     if not is_url(settings.out):
         print(f"Try it: cd {shlex.quote(settings.out)} && cmake -B build && cmake --build build "

@@ -97,11 +97,14 @@ def test_a_gpu_that_is_not_there_is_one_line(accelerator, said):
 
 @pytest.mark.parametrize(
     ("command", "arguments"),
-    [("export", ("model=mbkf15", "out=made here", "dataset=town")), ("navigate", (*SOLVED, "compiled=true"))],
+    [
+        ("export", ("model=plus", "rate_hz=10", "out=made here", "dataset=town")),
+        ("navigate", (*SOLVED, "compiled=true")),
+    ],
     ids=["export", "compiled step"],
 )
 def test_without_a_c_compiler(command, arguments, copy, call, tmp_path, monkeypatch):
-    """A filter is exported unchecked, and says so; a compiled step cannot be made."""
+    """A filter is exported unchecked, and says so, and its rate is too low; a compiled step cannot be made."""
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.delenv("CC", raising=False)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "logs"))
@@ -113,6 +116,7 @@ def test_without_a_c_compiler(command, arguments, copy, call, tmp_path, monkeypa
     else:
         assert ended.code == 0 and "not checked: no C compiler here" in ended.out, ended.err
         assert "Try it: cd 'made here' && cmake" in ended.out  # as a shell takes it
+        assert "plus needs samples at 50 Hz or more" in ended.out
         made = tmp_path / "made here"
         assert (made / "drive.csv").is_file() and (made / "CMakeLists.txt").is_file()
 

@@ -133,6 +133,16 @@ def test_a_fix_goes_to_the_first_boundary_at_or_after_it_and_keeps_its_lag():
     np.testing.assert_allclose(fixes.r_e[3], r_e, atol=1e-8)  # the latest in the epoch
 
 
+def test_a_position_that_repeats_is_that_of_the_first_time():
+    """Of a receiver that repeats its last position: the fix has the time of the one that it repeats."""
+    t = np.array([0.0, 0.6, 0.8, 1.0, 1.2, 1.6, 2.0])
+    gnss = _gnss(t)
+    for column in ("lat_deg", "lon_deg", "height_m"):
+        gnss[column][2:] = gnss[column][2]
+    fixes = assign_fixes(gnss, SampleGrid(0.0, 1.0, 3, 50))
+    np.testing.assert_allclose(fixes.lag[:3], [0.0, 0.2, 0.8], atol=1e-12)
+
+
 def test_unknown_stds_and_velocities():
     gnss = _gnss(np.arange(6.0))
     gnss["quality"] = np.array([4, 5, 2, 1, 0, 6])

@@ -103,6 +103,17 @@ def _look_back(tables: Tables) -> Tables:
 
 
 GYRO, ACCEL = ["gyro_x", "gyro_y", "gyro_z"], ["accel_x", "accel_y", "accel_z"]
+
+
+def _freeze(first: int, last: int):
+    def frozen(f):
+        values = f[[*ACCEL, *GYRO]].to_numpy().copy()
+        values[first:last] = values[first]
+        return f.assign(**dict(zip((*ACCEL, *GYRO), values.T)))
+
+    return _rows("imu", frozen)
+
+
 BAD = {
     "nan in the IMU": (_set("imu", "gyro_y", _at(17, np.nan)), "row 17: gyro_y is nan"),
     "inf in the IMU": (_set("imu", "accel_x", _at(18, np.inf)), "row 18: accel_x is inf"),
@@ -119,6 +130,7 @@ BAD = {
     "GNSS in ms": (_set("gnss", "t", lambda t: 5000 * t), r"t looks like ms.* by 1000 \(reader.gnss.time.unit=ms"),
     "a single fix": (_rows("gnss", lambda f: f[:1].assign(t=0.0)), "the only fix, at t = 0.000, .*all along the drive"),
     "nan time": (_set("gnss", "t", _at(3, np.nan)), "row 3: t is nan"),
+    "frozen IMU": (_freeze(3000, 3100), r"the same sample from t = 30\.0.* a frozen IMU"),
     "IMU gap": (_rows("imu", lambda f: f.drop(f.index[1000:1100])), "IMU gap of 1.010 s after t = 10.000"),
     "no samples": (_rows("imu", lambda f: f.iloc[:0]), "has no rows"),
     "no fixes": (_rows("gnss", lambda f: f.iloc[:0]), "has no rows"),
@@ -257,6 +269,11 @@ def test_a_broken_reference_is_not_opened_where_none_is_asked_for(tmp_path, tabl
     assert not load_dataset(tmp_path, reference=False)[0].ref_valid.any()
     shutil.rmtree(tmp_path / "reference")
     assert not load_dataset(tmp_path)[0].ref_valid.any()
+
+
+def test_a_sample_may_be_repeated_for_half_a_second(tmp_path, tables):
+    _write(tmp_path, _freeze(3000, 3050)(tables))
+    assert len(validate_dataset(tmp_path)) == 1
 
 
 def test_limits_of_gaps_are_configurable(tmp_path, tables):

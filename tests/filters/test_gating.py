@@ -235,3 +235,48 @@ def test_the_coarse_limit_by_hand():
         _, screened, after = gate.screen_fix(gate.begin(z), epoch._replace(z=z, fix=fix), P, fix.std.square())
         assert bool(screened.used[0, 0]) is kept and float(screened.z[0, 0]) == (z0 if kept else 0.0)
         assert torch.equal(after, P)
+
+
+def stopped_receiver(batch, epochs: slice, velocity: float = math.nan):
+    """Fixes whose position stays that of the first of these epochs, with another velocity or none."""
+    gnss, valid = batch.gnss.clone(), batch.gnss_valid.clone()
+    gnss[:, epochs, :3] = gnss[:, epochs.start, None, :3]
+    gnss[:, epochs, 3:] = 0.0 if math.isnan(velocity) else velocity
+    valid[:, epochs, 3:] &= not math.isnan(velocity)
+    return replace(batch, gnss=gnss, gnss_valid=valid)
+
+
+@pytest.mark.parametrize("name", ["mbkf15", "mbkf21_car", "plus"])
+@pytest.mark.parametrize("velocity", [math.nan, 0.0])
+def test_a_position_that_stays_while_the_car_moves_is_not_used(name, velocity):
+    """For half a minute, without a velocity or with one of zero: the solution without these fixes."""
+    batch = cars(name, 60)
+    frozen = stopped_receiver(batch, slice(29, 59), velocity)
+    frozen.gnss[:, 29], frozen.gnss_valid[:, 29] = batch.gnss[:, 29], batch.gnss_valid[:, 29]
+    both = solved(beside(frozen, hidden(batch, slice(30, 59))), name)
+    found, without = both.posterior.p_n.split(3)
+    assert not both.used[:3, 30:59].any() and both.used[:3, 59].all()
+    assert (found - without)[:, :59].abs().max() < (1.0 if name == "plus" else 1e-9)
+
+
+@pytest.mark.parametrize("name", ["mbkf15", "mbkf21_car"])
+def test_a_stationary_car_may_have_a_receiver_that_holds_its_position(name):
+    """A minute at rest with the same fix again and again: all are used."""
+    batch = slipping(3, 120, (0.0,) * 5, stop=60.0)
+    held = stopped_receiver(batch, slice(62, 120), 0.0)
+    assert solved(held, name).used.all()
+
+
+@pytest.mark.parametrize("name", ["mbkf15_gated", "mbkf21_car_gated", "plus"])
+@pytest.mark.parametrize("wrong", ["zero", "5 m/s more"])
+def test_wrong_velocities_are_not_followed_where_positions_contradict_them(name, wrong):
+    """For half a minute, beside positions of 5 cm: nearly the solution of the positions alone, and no position is
+    refused."""
+    batch = cars(name, 80)
+    gnss, valid = batch.gnss.clone(), batch.gnss_valid.clone()
+    gnss[:, 40:70, 3:] = 0.0 if wrong == "zero" else gnss[:, 40:70, 3:] + gnss.new_tensor([3.0, 4.0, 0.0])
+    valid[:, 40:70, 3:] = False
+    both = beside(replace(batch, gnss=gnss), replace(batch, gnss_valid=valid))
+    found = solved(both, name)
+    error = (found.posterior.p_n - both.truth.p_n)[:, 40:, :2].norm(dim=-1)
+    assert found.used.all() and error[:3].max() < error[3:].max() + 0.1

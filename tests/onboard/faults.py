@@ -141,6 +141,34 @@ def _frozen(sent: Calls) -> Calls:
     return _changed("gnss", _between(30.5, 38.5), lambda x: (x[0], *place, [5.0, 5.0, 0.0], *x[5:]))(sent)
 
 
+def _frozen_imu(first: float, last: float) -> Fault:
+    """One sample again and again, with stamps that go on."""
+
+    def made(sent: Calls) -> Calls:
+        held = next(c.arguments[1:] for c in sent if c.kind == "imu" and c.arguments[0] > first)
+        return _changed("imu", _between(first, last), lambda x: (x[0], *held))(sent)
+
+    return made
+
+
+def _repeated(sent: Calls) -> Calls:
+    """Samples ten times as seldom, each sent ten times."""
+    out, held, k = [], (), 0
+    for call in sent:
+        if call.kind == "imu":
+            held = call.arguments[1:] if k % 10 == 0 else held
+            call, k = Call("imu", (call.arguments[0], *held)), k + 1
+        out.append(call)
+    return out
+
+
+def _often(sent: Calls) -> Calls:
+    """Each fix four times more in the second after it."""
+    again = [Call("gnss", (c.arguments[0] + 0.2 * k, *c.arguments[1:])) for c in sent if c.kind == "gnss"
+             for k in range(1, 5)]  # fmt: skip
+    return sorted([*sent, *again], key=lambda call: call.arguments[0])
+
+
 def _fast_speeds(sent: Calls) -> Calls:
     """Speeds between those of the drive at every sample of five seconds, the first ten of them once more."""
     fast = [
@@ -200,7 +228,7 @@ FAULTS: dict[str, tuple[Fault, tuple[str, ...]]] = {
     "single fixes": (_one_by_one(
         "gnss", 0.5,
         lambda x: [x, x],
-        lambda x: [x, _put(x, 0, x[0] - 0.3)],  # an older one of the same interval
+        lambda x: [x, (x[0] - 0.3, x[1] + 1e-7, *x[2:])],  # an older one of the same interval
         lambda x: _put(x, 4, WITHOUT_VELOCITY),
         lambda x: [x, _put(x, 0, x[0] + 100)],  # ahead of the samples
         lambda x: _put(x, 1, nan),
@@ -231,6 +259,9 @@ FAULTS: dict[str, tuple[Fault, tuple[str, ...]]] = {
     "samples at half the rate": (lambda sent: [c for k, c in enumerate(sent) if k % 2 or c.kind != "imu"], ()),
     "a gap of 0.2 s": (_changed("imu", _between(30.1, 30.3), lambda x: []), ()),
     "a gap of 3 s": (_changed("imu", _between(30.1, 33.1), lambda x: []), ("gap", "restarted")),
+    "an IMU frozen for 5 s": (_frozen_imu(30.1, 35.1), ("frozen", "gap", "restarted")),
+    "an IMU frozen for 0.4 s": (_frozen_imu(30.1, 30.5), ()),
+    "an IMU that repeats each sample": (_repeated, ()),
     "clocks set back 50 s": (_clock(30.5, -50.0), ("back", "restarted")),
     "clocks set ahead 1e6 s": (_clock(30.5, 1e6), ("gap", "restarted")),
     "no fixes for 20 s": (_changed("gnss", _between(25.0, 45.0), lambda x: []), ()),
@@ -254,6 +285,7 @@ FAULTS: dict[str, tuple[Fault, tuple[str, ...]]] = {
     **{name: (lambda sent, jump=JUMPS[jump], late=late: late(jump(sent)), ("implausible_fix",))
        for name, (jump, late) in JUMPS_LATE.items()},
     "a frozen receiver without velocity down": (lambda sent: LEVEL(_frozen(sent)), ("implausible_fix",)),
+    "fixes at 5 Hz that hold the last position": (lambda sent: _often(ALONE(_frozen(sent))), ()),
     "a receiver that holds its last position": (lambda sent: ALONE(_frozen(sent)), ()),
     "sensors that mark invalid values": (
         _changed("speed", _between(25.0, 28.0), lambda x: _put(x, 1, 1.7e308)), ("implausible",)),
@@ -282,6 +314,7 @@ FAULTS: dict[str, tuple[Fault, tuple[str, ...]]] = {
 }  # fmt: skip
 USUAL = (  # one of each kind, of every day's tests; all of them: pytest -m exports
     "none", "single samples", "single fixes", "single samples of sensors", "a gap of 0.2 s", "a gap of 3 s",
+    "an IMU frozen for 5 s",
     "spikes in the last and the last but one sample of an update interval", "a tenth of the samples missing",
     "clocks set back 50 s", "coarse positions alone, 3 s late", *JUMPS, *JUMPS_LATE, "a first fix 18 s ahead",
     "wheel speeds at 100 Hz, some again after three seconds", "fix stamps that jitter", "sensors 15 s late",

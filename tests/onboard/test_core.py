@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from dlkf.data.aids import pressure_height
+from dlkf.onboard.c_source import COLUMNS
 from dlkf.onboard.core import Core, Status, Waiting
 from dlkf.onboard.library import find_compiler
 from dlkf.running.streaming import StreamingFilter
@@ -83,3 +84,16 @@ def test_samples_of_sensors_that_cannot_be_taken(exported):
     height = core._library.dlkf_pressure_height(95_000.0)
     assert height == pytest.approx(float(pressure_height(np.float64(95_000.0))), abs=1e-9) and 500 < height < 600
     assert [core.describe_status(x) for x in Status] and core.waiting is Waiting.SAMPLES and core.doubt == 1.0
+
+
+def test_a_rejected_innovation_has_its_own_1σ(exported, plain):
+    """Of fixes 100 m off, one in six, it is as large as that of those beside them."""
+    core, rows = Core(exported[3].path, ARM), []
+    for call in FAULTS["fixes 100 m off, one in six"][0](plain):
+        rows += list(getattr(core, call.kind)(*call.arguments).rows)
+    used, z, std = (
+        np.array(rows)[:, COLUMNS.index(x)] for x in ("gnss_used", "innovation_pos_n", "innovation_std_pos_n")
+    )
+    rejected = (used == 0) & (np.abs(z) > 50)
+    assert rejected.sum() > 3
+    np.testing.assert_allclose(std[rejected], np.median(std[used == 1]), rtol=0.5)

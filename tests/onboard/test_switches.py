@@ -54,6 +54,27 @@ def test_an_imu_faster_than_the_memory_holds_is_told(exported, log, tmp_path):
     assert done.returncode == 2 and "x refused: more samples than the memory holds" in done.stderr
 
 
+WRONG_SIZES = (
+    "LATE_S=-1",
+    "LATE_S=1.5",
+    "IMU_HZ=0",
+    "IMU_HZ=99.9",
+    "IMU_HZ=1",
+    "AID_HZ=0",
+    "SEARCH_S=-1",
+    "SEARCH_S=x",
+)
+
+
+def test_wrong_sizes_do_not_compile(exported):
+    compiler, source = str(find_compiler()), str(exported[0] / "dlkf.c")
+    for size in ("LATE_S=0", "SEARCH_S=0", "IMU_HZ=9", "AID_HZ=1", *WRONG_SIZES):
+        switches = ["-DDLKF_LATE_S=1"] * ("LATE_S" not in size) + [f"-DDLKF_{size}"]
+        done = subprocess.run([compiler, "-std=c99", "-Wundef", "-Werror", "-fsyntax-only", *switches, source],
+                              capture_output=True, text=True)  # fmt: skip
+        assert (done.returncode != 0) is (size in WRONG_SIZES), (size, done.stderr)
+
+
 @pytest.mark.parametrize("flag", ["-ffast-math", "-Ofast", "-ffinite-math-only"])
 def test_arithmetic_without_nan_is_refused(flag, exported):
     """It ran for ever."""
@@ -63,3 +84,11 @@ def test_arithmetic_without_nan_is_refused(flag, exported):
             [find_compiler(), "-std=c99", flag, "-fsyntax-only", exported[0] / name], capture_output=True, text=True
         )
         assert done.returncode and "compile without -ffast-math" in done.stderr, name
+
+
+def test_the_core_promotes_no_float(exported):
+    """Constants such as NAN are floats; the filter's own code, made from tensors of several types, is not meant."""
+    flags = (*STRICT, "-Wdouble-promotion", f"-I{exported[0]}", "-fsyntax-only")
+    sources = [*(exported[0] / name for name in CORE), EXAMPLES / "navigate.c"]
+    done = subprocess.run([str(find_compiler()), *flags, *sources], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr

@@ -58,6 +58,8 @@ def test_a_stamp_counts_once_and_the_latest_fix_of_a_boundary_is_its_own():
     assert history.add(0.0, 7, one[0])[1] == {7}
     fix = history.at(7)
     assert fix is not None and fix.t == 1.0 and history.at(6) is None
+    history.add(1.5, 7, one[1] | {"t": np.array([1.5])})
+    assert history.at(7) is fix  # the same position again is not a later one
     for k in range(3, 300):
         history.add(float(k), k, rows(gnss, np.array([k])))
     assert len(history._fixes) == HELD

@@ -99,3 +99,17 @@ def test_before_the_first_fix_so_many_seconds_are_kept_and_no_more():
     for k in range(1, 1001):
         assert stream.find_refusal(k / 100, (0.0, 0.0, -9.8), (0.0, 0.0, 0.0)) == ""
     assert stream._rows[-1][0] - stream._rows[0][0] == pytest.approx(2.0, abs=0.011)
+
+
+def test_a_sample_that_stays_the_same_is_refused_on_a_moving_car_alone():
+    """For longer than half a second; a stamp far ahead does not count."""
+    still = (0.0, 0.0, -9.8), (0.0, 0.0, 0.0)
+    for moves, refused in ((True, 50), (False, 0)):
+        s = ImuStream(50, 1.0, moves=lambda moves=moves: moves)
+        said = [s.find_refusal(t, *still) for t in (np.arange(1, 102) / 100).tolist()]
+        assert [bool(x) for x in said] == [False] * (101 - refused) + [True] * refused
+        assert all("frozen" in x for x in said if x)
+        assert s.find_refusal(1.02, (0.0, 0.0, -9.7), (0.0, 0.0, 0.0)) == (
+            "" if not moves else "gap of 0.510 s after t = 0.510000"
+        )
+        assert "gap" in s.find_refusal(9.0, *still)

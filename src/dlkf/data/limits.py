@@ -23,6 +23,7 @@ HEIGHTS_M = (-1000.0, 10_000.0)  # of a road above the ellipsoid
 LARGEST_STD = 1e4  # m, m/s: a fix with a larger 1σ is not used
 NOWHERE_DEG = 1e-6  # °, both: what receivers write before they have a position
 FROZEN_SPEED_M_S, FROZEN_M = 2.0, 10.0  # a position that stays while its own velocity makes such a way
+FROZEN_IMU_S = 0.5  # for so long all six numbers of an IMU may stay the same to the bit while the car moves
 AGREEING_FIXES, AGREEING_S = 5, 10.0  # refused fixes that agree with each other for so long replace the good one
 LEVER_ARM_M = 30.0  # no antenna of a car is further from its IMU
 ESTIMATE_M_S, ESTIMATE_HEIGHTS_M = 200.0, (-2000.0, 20_000.0)  # an estimate beyond is that of a diverged filter

@@ -15,9 +15,9 @@ from dlkf.data.discovery.clock import ImuSums, Lag, describe_offset, find_lag
 from dlkf.data.discovery.drift import ROUGH_S, compare_ends, find_drifting_pose, find_step
 from dlkf.data.discovery.motion import Motion, find_motion, stretches
 from dlkf.data.discovery.units import compare_climbs, nearest_unit
-from dlkf.data.limits import DEGREE_M, NOWHERE_DEG
+from dlkf.data.limits import DEGREE_M, FROZEN_IMU_S, FROZEN_SPEED_M_S, NOWHERE_DEG, known_speed
 from dlkf.data.readers.units import LENGTH
-from dlkf.data.schema import ACCEL, GYRO, stack_columns
+from dlkf.data.schema import ACCEL, GYRO, VELOCITY, stack_columns
 from dlkf.data.tables import Columns
 from dlkf.navigation.earth import SEMI_MAJOR
 
@@ -301,6 +301,22 @@ def check_dead_axes(imu: Columns, moved: Motion, where: str, frd: bool = True) -
         if shown and np.ptp(imu[name]) == 0:
             raise InputError(
                 f"{where}: {name} is {imu[name][0]:g} in every row though the car {what}: a dead axis, or no data of it"
+            )
+
+
+def check_frozen(imu: Columns, gnss: Columns, where: str) -> None:
+    """No sample that is the same to the bit for ``FROZEN_IMU_S`` while the car moves."""
+    t, speed = imu["t"], known_speed(stack_columns(gnss, VELOCITY))
+    changes = np.zeros(len(t) - 1, bool)
+    for column in (*GYRO, *ACCEL):
+        changes |= np.diff(imu[column]) != 0
+    edges = np.concatenate(([0], np.flatnonzero(changes) + 1, [len(t)]))
+    begin, end = t[edges[:-1]], t[edges[1:] - 1]
+    for first, last in zip(begin[long := end - begin > FROZEN_IMU_S], end[long]):
+        if np.interp((first, last), gnss["t"], speed).min() > FROZEN_SPEED_M_S:
+            raise InputError(
+                f"{where}: the same sample from t = {first:.3f} to {last:.3f} while the car moves: a frozen IMU; leave "
+                "these rows out and split the drive there (dlkf.ingest split_gaps=true)"
             )
 
 

@@ -165,12 +165,16 @@ BLANK = {"r_e": np.nan, "v_e": np.nan, "std": np.nan, "valid": False, "lag": 0.0
 def assign_fixes(gnss: Columns, grid: SampleGrid) -> FixRows:
     """Each fix to the first boundary at or after it; the latest in an epoch wins.
 
+    A position that repeats the one before to the bit is that of the earlier time, so it does not count as a later one.
     Unknown stds take the defaults of ``DEFAULT_STD``; components that are NaN are not valid.
     """
     rows = grid.epochs + 1
     place = find_boundary(gnss["t"], grid)
     inside = np.flatnonzero(usable_fixes(gnss) & (place >= 0) & (place < rows))
-    chosen = np.full(rows, -1)
+    repeats = np.diff(place[inside], prepend=-1) == 0
+    for column in POSITION:
+        repeats &= np.diff(gnss[column][inside], prepend=np.nan) == 0
+    inside, chosen = inside[~repeats], np.full(rows, -1)
     chosen[place[inside]] = inside  # rows are in order of time: the last assignment stays
     at = np.flatnonzero(chosen >= 0)
     found = make_fixes(gnss, chosen[at], grid.boundaries[at])

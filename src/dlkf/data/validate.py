@@ -14,7 +14,7 @@ from dlkf.data.aid_checks import check_aid
 from dlkf.data.aid_tables import STANDARD, AidTable
 from dlkf.data.discovery.motion import find_motion
 from dlkf.data.limits import FULL_SCALE, NONE_REFUSED, Refused, screen_fixes, within_full_scale
-from dlkf.data.plausibility import check_clocks, check_gnss_units, check_imu_units, check_turns
+from dlkf.data.plausibility import check_clocks, check_frozen, check_gnss_units, check_imu_units, check_turns
 from dlkf.data.readers.units import DAY_S, GPS_EPOCH_UNIX, WEEK_S
 from dlkf.data.reference_checks import check_attitude, check_same_clock, check_same_place
 from dlkf.data.schema import ACCEL, ATTITUDE, GYRO, POSITION, STD, VELOCITY, stack_columns
@@ -99,6 +99,7 @@ def check_tables(tables: CheckedTables, limits: Limits = LIMITS) -> CheckedTable
     refused = Refused(len(tables.imu["t"]) - len(imu["t"]), len(tables.gnss["t"]) - len(gnss["t"]))
     if any(refused):
         tables = replace(tables, imu=imu, gnss=gnss, refused=refused)
+    check_frozen(imu, read_fixes(gnss), _where(name, "imu"))
     check_turns(imu, gnss, _where(name, "imu"))
     check_clocks(imu, read_fixes(gnss), _where(name, "imu"))
     if truth is not None:

@@ -12,11 +12,13 @@ large innovations all the time, and loses no fixes for that; an outlier is one t
 
 A filter that is sure of a wrong position would refuse good fixes; so with ``PATIENCE`` in a row that agree with each
 other they pass, and z² is added to the variance: the position is elsewhere, for whichever reason, and attitude and
-biases need not explain it. A receiver that repeats the same fix while the car moves is frozen, and not used until it
-changes.
+biases need not explain it. Velocities do not pass in this way while positions in the same fixes show that they are
+wrong: those are no outliers, but would be if the filter had moved with the refused velocities. Nor do such velocities
+become usual. A receiver that repeats the same fix while the car moves is frozen, and not used until it changes.
 
 Filters without that gate have a coarse one that cannot be switched off (:class:`CoarseGate`): a fix ``COARSE_SIGMAS``
-off, such as the first one after a tunnel, is left out. On data whose noise is as stated it never acts.
+off, such as the first one after a tunnel, is left out, and so are the fixes of a frozen receiver: positions that are
+the same to the bit while the filter has moved. On data whose noise is as stated it never acts.
 """
 
 from __future__ import annotations
@@ -42,6 +44,8 @@ FIRST_USUAL = 2.0  # of that logarithm: a filter's first seconds may be worse th
 PARTS, OF_PART = [0, 2, 3, 5], [0, 0, 1, 2, 2, 3]  # a component of each part; the part of each component
 MEDIANS = (0.6931, 0.4549, 0.6931, 0.4549)  # of d² of each part: of χ² of two and of one degree of freedom
 FROZEN_SPEED = 1.0  # m/s: above, a fix cannot be the same twice
+FROZEN_M, FROZEN_SIGMAS = 1.0, 5.0  # of the filter's motion, beyond which a fix cannot be the same for the coarse gate
+FROZEN_KEEP = 0.9  # of that motion per fix that was used: errors of a stationary car's velocity do not add up
 COARSE_SIGMAS, COARSE_FLOOR = 20.0, (2.0, 0.5)  # m, m/s added to 1σ of position and velocity: an error, no noise
 COARSE_PATIENCE = 2  # refused fixes that agree with each other before such a filter recovers
 COARSE_AGREEMENT = 2.0  # m/s beyond their 1σ that two of them may differ by
@@ -91,6 +95,9 @@ class CoarseMemory(NamedTuple):
     fix: Tensor  # (B, 6) the last refused one
     moves: Tensor  # (B,) bool: it had a velocity
     age: Tensor  # (B,) s since then
+    place: Tensor  # (B, 3) the last position offered
+    moved: Tensor  # (B, 3) m, how far the filter has moved while it was the same
+    frozen: Tensor  # (B,) bool: further than a fix can be the same
 
 
 @runtime_checkable
@@ -115,32 +122,54 @@ class CoarseGate:
     P is that of the update before, position's grown by velocity's over the update interval. Refused fixes are compared
     with each other, not with the filter: with ``COARSE_PATIENCE`` in a row whose positions and velocities agree they
     pass, so that a filter that is itself wrong loses one fix; beyond ``COARSE_JUMP`` P is inflated.
+    A position that stays the same to the bit while the filter moves by ``FROZEN_M`` and ``FROZEN_SIGMAS`` is left out.
     """
 
     def begin(self, like: Tensor) -> CoarseMemory:
         """Nothing refused yet; ``like`` (B, …) gives batch and precision."""
         B, zeros = len(like), like.new_zeros
-        return CoarseMemory(zeros(B), zeros(B, 6), zeros(B) > 0, zeros(B))
+        nowhere = torch.full_like(zeros(B, 3), torch.nan)
+        return CoarseMemory(zeros(B), zeros(B, 6), zeros(B) > 0, zeros(B), nowhere, zeros(B, 3), zeros(B) > 0)
 
     def screen_fix(
         self, memory: CoarseMemory, epoch: Epoch, P: Float[Tensor, "B n n"], R: Float[Tensor, "B 6"]
     ) -> tuple[CoarseMemory, Epoch, Float[Tensor, "B n n"]]:
         """The epoch without what is refused, and P, inflated where the gate recovers; it judges by the fix's own 1σ,
         not by the ``R`` that the filter takes it for."""
-        if may_branch(epoch.z) and float(epoch.z.detach().abs().max()) <= NEAR and not bool(memory.refused.any()):
-            return memory, epoch, P
         with torch.no_grad():
-            memory, verdict = self._judge(memory, epoch, P.diagonal(dim1=-2, dim2=-1))
+            span, variance = epoch.dt * epoch.imu.shape[1], P.diagonal(dim1=-2, dim2=-1)
+            grown = torch.cat((variance[:, :3] + span * span * variance[:, 3:6], variance[:, 3:6]), -1)
+            memory = self._find_frozen(memory, epoch, grown)
+        quiet = ~(memory.refused > 0) & ~memory.frozen
+        if may_branch(epoch.z) and float(epoch.z.detach().abs().max()) <= NEAR and bool(quiet.all()):
+            return memory, epoch, P
+        offered = epoch.used & ~memory.frozen.unsqueeze(-1)
+        epoch = epoch._replace(z=epoch.z * offered, fix=epoch.fix._replace(used=offered))
+        with torch.no_grad():
+            memory, verdict = self._judge(memory, epoch, grown)
         fix = epoch.fix._replace(used=verdict.passed)
         return memory, epoch._replace(z=epoch.z * verdict.passed, fix=fix), verdict.inflate_covariance(P)
 
-    def _judge(
-        self, memory: CoarseMemory, epoch: Epoch, variance: Float[Tensor, "B n"]
-    ) -> tuple[CoarseMemory, Verdict]:
+    @staticmethod
+    def _find_frozen(memory: CoarseMemory, epoch: Epoch, grown: Float[Tensor, "B 6"]) -> CoarseMemory:
+        """The memory after the position of a fix was compared with the last one."""
+        position, place = epoch.used[:, :3].any(-1), epoch.fix.value[:, :3]
+        same = (place == memory.place).all(-1)
+        keep = torch.where(position & ~memory.frozen, FROZEN_KEEP, 1.0).unsqueeze(-1)
+        moved = keep * memory.moved + (epoch.window.end.p_n - epoch.start.p_n)
+        moved = torch.where((position & ~same).unsqueeze(-1), 0.0, moved)
+        square = moved.square().sum(-1)
+        frozen = same & (square > FROZEN_M**2) & (square > FROZEN_SIGMAS**2 * grown[:, :3].sum(-1))
+        return memory._replace(
+            place=torch.where(position.unsqueeze(-1), place, memory.place),
+            moved=moved,
+            frozen=torch.where(position, frozen, memory.frozen),
+        )
+
+    def _judge(self, memory: CoarseMemory, epoch: Epoch, grown: Float[Tensor, "B 6"]) -> tuple[CoarseMemory, Verdict]:
         z, used, span = epoch.z, epoch.used, epoch.dt * epoch.imu.shape[1]
         R, age = epoch.fix.std.square(), memory.age + span
         floor = torch.cat([torch.full_like(z[:, :3], x * x) for x in COARSE_FLOOR], -1)
-        grown = torch.cat((variance[:, :3] + span * span * variance[:, 3:6], variance[:, 3:6]), -1)
         squares = torch.where(used, z.square() / (grown + R + floor), 0.0)
         position = used[:, :3].any(-1)
         wrong = squares[:, :3].sum(-1) > COARSE_SIGMAS**2
@@ -158,11 +187,11 @@ class CoarseGate:
             shift=torch.where(jumps.unsqueeze(-1) & passes, z * z, 0.0),
             factor=torch.where(jumps, mean.clamp(1.0, MOST_DOUBT), 1.0),
         )
-        return CoarseMemory(
-            torch.where(yields, 0.0, refused),
-            torch.where(wrong.unsqueeze(-1), epoch.fix.value, memory.fix),
-            torch.where(wrong, moves, memory.moves),
-            torch.where(wrong, 0.0, age),
+        return memory._replace(
+            refused=torch.where(yields, 0.0, refused),
+            fix=torch.where(wrong.unsqueeze(-1), epoch.fix.value, memory.fix),
+            moves=torch.where(wrong, moves, memory.moves),
+            age=torch.where(wrong, 0.0, age),
         ), verdict
 
     @staticmethod
@@ -212,7 +241,8 @@ class Gate:
         S = _predicted_variance(epoch, P) + R + FLOOR * FLOOR
         square = average_by_part(torch.where(used, z.square() / S, 0.0))
         offered = used[:, PARTS] & ~frozen.unsqueeze(-1)
-        outlier = offered & (square > memory.limits * torch.exp(memory.usual))
+        limit = memory.limits * torch.exp(memory.usual)
+        outlier = offered & (square > limit)
         wrong = torch.stack((outlier[:, :2].any(-1), outlier[:, 2:].any(-1)), -1)
 
         age = memory.age + span
@@ -225,6 +255,12 @@ class Gate:
         seen = torch.stack((offered[:, :2].any(-1), offered[:, 2:].any(-1)), -1)
         refused = torch.where(wrong, refused, torch.where(seen, 0.0, memory.refused))
         follows = wrong & (refused >= PATIENCE)
+        # with refused velocities, positions would be off by so much: where they are not, the filter is right
+        way = z[:, 3:] * used[:, 3:] * (span * refused[:, 1:])
+        far = average_by_part(torch.cat((z[:, :3] - way, way), -1).square() / S)[:, :2]
+        fits = offered[:, :2] & ~outlier[:, :2] & (far > limit[:, :2])
+        denied = torch.stack((torch.zeros_like(position), (outlier[:, 2:] & fits).any(-1)), -1)
+        follows = follows & ~denied
         of_parts, of_components = follows[:, [0, 0, 1, 1]], follows[:, [0, 0, 0, 1, 1, 1]]
 
         passed = offered & (~outlier | of_parts)
@@ -232,7 +268,7 @@ class Gate:
         more = square > square.new_tensor(MEDIANS) * torch.exp(memory.usual)
         usual = (memory.usual + torch.where(more, USUAL_STEP, -USUAL_STEP)).clamp_min(0.0)
         return GateMemory(
-            torch.where(offered, usual, memory.usual),
+            torch.where(offered & ~denied[:, [0, 0, 1, 1]], usual, memory.usual),
             torch.where(follows, 0.0, refused),
             torch.where(wrong[:, [0, 0, 0, 1, 1, 1]], z, memory.innovation),
             torch.where(wrong, 0.0, age),

@@ -90,6 +90,7 @@ class Correction(NamedTuple):
     covariances: Covariances | None = None
     aids: Tensor | None = None  # (B, A) of further sensors, see dlkf.filters.aids.attach.aid_columns
     innovation: Tensor | None = None  # (B, 6) as the estimator predicts the fix; None: as the loop does
+    rejected: Tensor | None = None  # (B, 6) variance of the innovations that a gate has left out, zero for others
 
 
 @runtime_checkable

@@ -21,7 +21,16 @@ from dlkf.filters.heavy_tails import HeavyTails
 from dlkf.filters.integration import Correction, Covariances, Epoch, Estimator
 from dlkf.filters.kalman_update import kalman_prediction, kalman_update
 from dlkf.filters.receiver import add_drift, has_receiver, let_delay_grow, predict_fix, widen_start
-from dlkf.filters.sources import FixMemory, GnssFix, Measurement, Parameter, Predicted, Source, describe_aid
+from dlkf.filters.sources import (
+    FixMemory,
+    GnssFix,
+    Measurement,
+    Parameter,
+    Predicted,
+    Source,
+    describe_aid,
+    predicted_variance,
+)
 from dlkf.filters.tuning import Prior, Tuning
 from dlkf.navigation.calibration import ImuError
 from dlkf.navigation.earth import STANDARD_GRAVITY
@@ -176,8 +185,22 @@ class Mbkf:
         """:meth:`update` with what the gate leaves of the fix."""
         memory = self.advance_delay(memory, epoch.dt * epoch.imu.shape[1])
         epoch = self.predict_fix(memory, epoch)
-        memory, correction = self.update(*self.screen_fix(memory, epoch))
-        return memory, correction._replace(innovation=epoch.z)
+        memory, screened = self.screen_fix(memory, epoch)
+        after, correction = self.update(memory, screened)
+        rejected = self.find_rejected(memory, epoch, screened, correction)
+        return after, correction._replace(innovation=epoch.z, rejected=rejected)
+
+    def find_rejected(
+        self, memory: KalmanMemory, offered: Epoch, screened: Epoch, correction: Correction
+    ) -> Float[Tensor, "B 6"] | None:
+        """Variance of the innovations of an ``offered`` fix that the gate has left out, zero for others; None where it
+        has left out none. ``memory`` is that before the update."""
+        rejected, c = offered.used & ~screened.used, correction.covariances
+        if c is None or (may_branch(offered.z) and not bool(rejected.any())):
+            return None
+        with torch.no_grad():
+            H, R = self.fix.matrix(offered), self.fix.variance(offered, memory.fix, memory.noise)
+            return torch.where(rejected, predicted_variance(c.predicted, H) + R, 0.0)
 
     def advance_delay(self, memory: KalmanMemory, seconds: float) -> KalmanMemory:
         """At the end of an update interval, as far as the fix is concerned: its delay has grown."""

@@ -213,6 +213,7 @@ class PlusFilter(nn.Module):
         process = in_force * torch.cat((levels, levels.clamp_min(1.0)), -1).unsqueeze(-1)
         advice = NetworkOutput(process, memory.errors.noise(offered, kalman.fix.scale[0, 0, 0]))
         kalman, correction = self.kalman.update(memory.kalman, epoch._replace(advice=advice))
+        rejected = self.kalman.find_rejected(memory.kalman, offered._replace(advice=advice), epoch, correction)
         with torch.no_grad():
             after = epoch.window.end.correct(correction.dx)
             forward = (after.C_nb[:, :, 0] * after.v_n).sum(-1)
@@ -226,7 +227,7 @@ class PlusFilter(nn.Module):
                 matching = matching.update_ratios(c.dx, c.predicted, c.updated, epoch.window.end.C_nb, fixed)
         if correction.std is not None:
             correction = correction._replace(std=errors.add_slow_std(correction.std))
-        correction = correction._replace(innovation=claimed.z)
+        correction = correction._replace(innovation=claimed.z, rejected=rejected)
         return memory._replace(
             kalman=kalman, hidden=hidden, matching=matching, outage=outage, errors=errors, fix_noise=fix_noise,
             gyro_noise=gyro_noise, fix_speed=torch.where(fixed, forward, memory.fix_speed),

@@ -179,7 +179,8 @@ def load(
 
 def Stream(
     model: str | Path = "plus", *, rate_hz: float | None = None, imu_type: str | Mapping[str, Any] = "automotive_mems",
-    tuning: str | Mapping[str, Any] = "untuned", lever_arm: Sequence[float] = (0.0, 0.0, 0.0), **options: Any,
+    tuning: str | Mapping[str, Any] = "untuned", lever_arm: Sequence[float] = (0.0, 0.0, 0.0),
+    aids: Sequence[str] | None = None, **options: Any,
 ) -> StreamingFilter:  # fmt: skip
     """A filter fed sample by sample and fix by fix, as in a vehicle.
 
@@ -193,6 +194,9 @@ def Stream(
         As in :func:`navigate`.
     lever_arm : sequence of 3 floats
         IMU → antenna, Forward-Right-Down [m].
+    aids : sequence of str, optional
+        Further sensors that the filter takes, of ``speed``, ``heading`` and ``baro``; a filter with vehicle constraints
+        (``_nhc``, ``_car``, ``plus``) does. Their samples go to the methods of these names.
     **options
         Of :class:`~dlkf.running.streaming.StreamingFilter`: ``epoch_s`` [s], ``history_s`` (how late a fix may be), ….
 
@@ -206,10 +210,13 @@ def Stream(
     Raises
     ------
     InputError
-        For options that do not exist, and a filter that cannot work on such a grid.
+        For options that do not exist, sensors that the filter does not take, and a filter that cannot work on such a
+        grid.
     """
+    from dlkf.filters.aids.attach import add_chosen_aids
     from dlkf.filters.saved import choose_grid
     from dlkf.running.streaming import StreamingFilter
+    from dlkf.tracking.models import short_name
 
     check_options("Stream", options, StreamingFilter, apart=("estimator", "rate_hz"))
     epoch_s = options.pop("epoch_s", None)
@@ -217,6 +224,8 @@ def Stream(
     check_above_zero(**{name: value for name, value in given.items() if value is not None})
     arm = check_lever_arm(options.pop("lever_arm_b", lever_arm))
     estimator = load(model, imu_type=imu_type, tuning=tuning)
+    if aids is not None:
+        estimator = add_chosen_aids(short_name(check_model(model)), estimator, aids)
     grid = choose_grid([estimator], rate_hz, epoch_s, 1.0)
     return StreamingFilter(estimator, **grid, lever_arm_b=arm, **options)
 

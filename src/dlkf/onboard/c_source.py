@@ -233,8 +233,8 @@ def constants() -> str:
         (earth, ("SEMI_MAJOR", "SEMI_MINOR", "ECCENTRICITY_SQ", "EARTH_RATE", "GRAVITY_EQUATOR", "SOMIGLIANA",
                  "GRAVITATIONAL_CONSTANT", "STANDARD_GRAVITY")),
         (limits, ("FASTEST_M_S", "STEEPEST_M_S", "JUMP_M", "JUMP_SIGMAS", "MOST_JUMP_STD_M", "LARGEST_STD",
-                  "NOWHERE_DEG", "FROZEN_SPEED_M_S", "FROZEN_M", "AGREEING_FIXES", "AGREEING_S", "ESTIMATE_M_S",
-                  "LOST_M", "LOST_SIGMAS", "LOST_FIXES", "LOST_S", "LOST_SHARE", "EARTH_M")),
+                  "NOWHERE_DEG", "FROZEN_SPEED_M_S", "FROZEN_M", "FROZEN_IMU_S", "AGREEING_FIXES", "AGREEING_S",
+                  "ESTIMATE_M_S", "LOST_M", "LOST_SIGMAS", "LOST_FIXES", "LOST_S", "LOST_SHARE", "EARTH_M")),
     ):  # fmt: skip
         values |= {name: getattr(module, name) for name in names}
     lines = [f"#define {name} ({value!r})" for name, value in values.items()]

@@ -46,6 +46,7 @@ OUTPUTS = {
     "innovation": 6,
     "innovation_covariance": 36,
     "position_covariance": 4,
+    "rejected": 6,
     "used": 1,
 }
 _PV = ("pos_n", "pos_e", "pos_d", "vel_n", "vel_e", "vel_d")
@@ -181,10 +182,11 @@ class Turn(Function):
         S, P = z.new_full((len(z), 36), torch.nan), z.new_full((len(z), 4), torch.nan)
         if (c := answer.covariances) is not None:
             S, P = c.innovation.flatten(1), c.predicted[:, :2, :2].flatten(1)
+        rejected = torch.zeros_like(z) if answer.rejected is None else answer.rejected
         std = z.new_full((len(z), 15), torch.nan) if answer.std is None else answer.std
         said = z.new_zeros(len(z), 0) if answer.aids is None else answer.aids
         outputs = (
-            *flatten_state(step.prior), *flatten_state(step.posterior), step.complete_error, std, z, S, P,
+            *flatten_state(step.prior), *flatten_state(step.posterior), step.complete_error, std, z, S, P, rejected,
             used.double().unsqueeze(-1), said,
         )  # fmt: skip
         return self.layout.pack(after), torch.cat([x.double() for x in outputs], -1)
@@ -250,7 +252,8 @@ class Row(Function):
         columns = solution_columns(outputs[:, 0], x.frame, state, part["error"], part["std"])
         away = state.p_n[:, :2].norm(dim=-1, keepdim=True)
         solution = torch.stack([columns[c] for c in COLUMNS[1:]], -1)
-        innovation_std = part["innovation_covariance"][:, ::7].clamp_min(0).sqrt()
+        variance, rejected = part["innovation_covariance"][:, ::7], part["rejected"]
+        innovation_std = torch.where(rejected > 0, rejected, variance).clamp_min(0).sqrt()
         return torch.cat((solution, part["used"], part["innovation"], innovation_std, away, part["aids"]), -1)
 
 

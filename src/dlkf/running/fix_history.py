@@ -25,6 +25,12 @@ class ScreenedFix:
     reason: str = ""
     used: bool = False
 
+    @property
+    def place(self) -> tuple[float, float, float]:
+        """Latitude, longitude [°] and height [m]."""
+        lat, lon, height = (float(self.table[name][0]) for name in POSITION)
+        return lat, lon, height
+
 
 class FixHistory:
     """The screen over fixes that may come out of order: what is refused is what a log in order of time would refuse.
@@ -60,8 +66,12 @@ class FixHistory:
         return fix, self._screen(self._fixes)
 
     def at(self, boundary: int) -> ScreenedFix | None:
-        """The latest fix of a boundary that is not refused."""
-        return next((fix for fix in reversed(self._fixes) if fix.boundary == boundary and fix.used), None)
+        """The latest fix of a boundary that is not refused and does not repeat the position before."""
+        found: ScreenedFix | None = None
+        for fix in self._fixes:
+            if fix.boundary == boundary and fix.used and (found is None or fix.place != found.place):
+                found = fix
+        return found
 
     def _screen(self, fixes: Iterable[ScreenedFix]) -> set[int]:
         changed = set()
@@ -75,6 +85,5 @@ class FixHistory:
 
 def _refusal(screen: FixScreen, fix: ScreenedFix) -> str:
     """Why no car can have reached a fix, or nothing."""
-    lat, lon, height = (float(fix.table[name][0]) for name in POSITION)
     speed = float(known_speed(np.array([fix.table[name][0] for name in VELOCITY])))
-    return screen.find_refusal(fix.t, (lat, lon, height), speed, np.array([fix.table[name][0] for name in STD]))
+    return screen.find_refusal(fix.t, fix.place, speed, np.array([fix.table[name][0] for name in STD]))

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from dlkf.base.errors import InputError
-from dlkf.data.limits import FULL_SCALE
+from dlkf.data.limits import FROZEN_IMU_S, FULL_SCALE
 from dlkf.data.resampling import SampleGrid, epoch_grid, resample_imu, samples_per_epoch
 from dlkf.data.schema import ACCEL, GYRO
 from dlkf.data.spikes import AHEAD, SpikeScreen
@@ -28,7 +28,8 @@ class ImuStream:
     A sample is in line if its stamp lies after the last one, by no more than ``limits`` call a gap; missing
     samples within are bridged as the loader does. Out of line are stamps that run back or leap ahead. Spikes are left
     out (:mod:`dlkf.data.spikes`), ``spikes`` of them so far; while a sample may prove to be one, an epoch that ends
-    with it waits for up to two more.
+    with it waits for up to two more. While the car moves (``moves``), samples that have been the same to the bit for
+    ``FROZEN_IMU_S`` are refused as those of a frozen IMU, so that they count as a gap.
     """
 
     def __init__(
@@ -39,9 +40,11 @@ class ImuStream:
         step_s: float | None = None,
         limits: Limits = LIMITS,
         keep_s: float = 10.0,
+        moves: Callable[[], bool] | None = None,
     ) -> None:
         self._samples = samples_per_epoch(rate_hz, epoch_s)
         self._rate_hz, self._epoch_s, self._limits, self._keep_s = rate_hz, epoch_s, limits, keep_s
+        self._moves = moves
         self._given, self._screen, self.spikes = step_s, SpikeScreen(), 0
         self.clear()
 
@@ -49,6 +52,8 @@ class ImuStream:
         """Drop all samples and the grid."""
         self._rows: deque[tuple[float, ...]] = deque()
         self._screen.clear()
+        self._same: tuple[float, ...] = ()  # the last sample without its stamp,
+        self._same_since = self._same_last = -math.inf  # and the first and last stamp of its repetitions
         self._astray: tuple[float, float] | None = None  # first and last stamp of a run out of line
         self._step = self._given
         self._longest = self._longest_step(self._given)
@@ -84,6 +89,8 @@ class ImuStream:
             return "t, accel or gyro is not a finite number"
         if max(map(abs, row[1:4])) > FULL_SCALE[0] or max(map(abs, row[4:])) > FULL_SCALE[1]:
             return f"accel or gyro is beyond {FULL_SCALE[0]:g} m/s², {FULL_SCALE[1]:g} rad/s"
+        if self._is_frozen(row[0], row[1:]):
+            return f"the same sample since t = {self._same_since:.3f} while the car moves: a frozen IMU"
         last = self.latest
         if self._rows and not last < row[0] <= last + self._longest:
             return self._out_of_line(row[0], last)
@@ -150,6 +157,12 @@ class ImuStream:
         if span <= 4 * math.ulp(begin):
             return None
         return self._resample(SampleGrid(begin, span, 1, self._samples)), span / self._samples
+
+    def _is_frozen(self, t: float, values: tuple[float, ...]) -> bool:
+        if values != self._same or not 0 <= t - self._same_last <= self._longest:
+            self._same, self._same_since = values, t
+        self._same_last = t
+        return t - self._same_since > FROZEN_IMU_S and self._moves is not None and self._moves()
 
     def _resample(self, grid: SampleGrid) -> np.ndarray:
         table = np.array(self._rows)

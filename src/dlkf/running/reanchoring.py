@@ -94,7 +94,8 @@ def _(
     if isinstance(gate, GateMemory):  # NaN: equal to no other fix, so a frozen receiver shows one fix later
         gate = gate._replace(innovation=change.vectors(gate.innovation), fix=torch.full_like(gate.fix, torch.nan))
     else:
-        gate = gate._replace(fix=change.fixes(gate.fix))
+        nowhere = torch.full_like(gate.place, torch.nan)
+        gate = gate._replace(fix=change.fixes(gate.fix), place=nowhere, moved=change.vectors(gate.moved))
     if noise is not None:
         noise = noise._replace(Q=change.covariance(noise.Q), R=change.variances(noise.R))
     sources = tuple(

@@ -19,6 +19,8 @@ solution to rounding, for any order in which fixes arrive:
   car, or stays far from fixes that agree with each other (:mod:`dlkf.running.loss`).
 * **Spikes** of the IMU are left out as in a log; an epoch whose last sample may be one closes up to two samples later
   (:mod:`dlkf.data.spikes`).
+* **A frozen IMU**, which repeats the same sample while the car moves, is refused after half a second; what follows is
+  a gap.
 * **Physical limits**: samples beyond full scale and fixes that no car can have reached since the last good one are
   refused and counted before any filter sees them (:mod:`dlkf.data.limits`), whatever the order of arrival
   (:mod:`dlkf.running.fix_history`).
@@ -42,6 +44,7 @@ from dlkf.base.errors import InputError
 from dlkf.base.settings import is_number
 from dlkf.data.aids import LARGEST_VALUE, pressure_height
 from dlkf.data.alignment import SEARCH, AlignConfig
+from dlkf.data.limits import FROZEN_SPEED_M_S
 from dlkf.data.resampling import ON_BOUNDARY_S, find_boundary, make_fixes
 from dlkf.data.validate import LIMITS, Limits
 from dlkf.filters.aids.attach import find_tables
@@ -125,7 +128,7 @@ class StreamingFilter:
         self.estimator, self._rate_hz = estimator, rate_hz
         self._phase_s, self._history_s = phase_s, history_s
         self._samples = ImuStream(
-            rate_hz, epoch_s, step_s=imu_step_s, limits=limits, keep_s=max(history_s, 2 * SETTLE_S)
+            rate_hz, epoch_s, step_s=imu_step_s, limits=limits, keep_s=max(history_s, 2 * SETTLE_S), moves=self._moves
         )
         self._rewind = math.ceil(history_s / epoch_s) + 1  # epochs that may be replayed
         self.counts: Counter[str] = Counter()
@@ -266,6 +269,11 @@ class StreamingFilter:
         imu, dt = torch.from_numpy(tail[0]).to(self._epochs.device), tail[1]
         window = strapdown(running.state, running.error.correct(imu), dt, running.frame)
         return replace(latest, t=self._samples.settled, frame=running.frame, state=window.end, gnss_used=False)
+
+    def _moves(self) -> bool:
+        """Whether the car moved at the end of the last epoch, as far as the filter knows."""
+        latest = self._epochs.latest
+        return latest is not None and float(latest.state.v_n.norm()) > FROZEN_SPEED_M_S
 
     def _answer(self, status: Status, reason: str = "", estimates: Sequence[Estimate] = ()) -> Receipt:
         self.counts[status] += 1

@@ -8,7 +8,7 @@ from dataclasses import is_dataclass, replace
 from typing import Any
 
 from dlkf.base.errors import InputError
-from dlkf.data.aid_tables import AidTable
+from dlkf.data.aid_tables import AidTable, standard_tables
 from dlkf.filters.aids.g_sensitivity import GSensitivity
 from dlkf.filters.aids.heading import DualAntennaHeading
 from dlkf.filters.aids.height import Barometer
@@ -45,11 +45,13 @@ def add_sources(kalman: Mbkf, kinds: Sequence[type[Source]]) -> Mbkf:
     return replace(kalman, states=states, sources=(*sensors, *own, *others))
 
 
-def with_aids(model: Any, tables: Iterable[AidTable]) -> Any:
-    """A filter that also takes these sensors of the contract, if it has vehicle constraints (``_nhc``, ``_car``, plus).
+def with_aids(model: Any, tables: Iterable[AidTable | str]) -> Any:
+    """A filter that also takes these sensors of the contract, tables or names, if it has vehicle constraints
+    (``_nhc``, ``_car``, plus).
 
     Others are given back as they are, and so is a filter that has all of them.
     """
+    tables = [standard_tables([x])[0] if isinstance(x, str) else x for x in tables]
     if isinstance(model, SmoothedSolution):
         return SmoothedSolution(with_aids(model.filter, tables))
     inner = getattr(model, "kalman", model)
@@ -73,6 +75,19 @@ def refuse_left_out(models: Mapping[str, Any], tables: Iterable[AidTable]) -> No
                 f"aids=[{','.join(x.name for x in tables)}] leaves out {left_out[0]}, which model={name} takes by its "
                 f"name; take +{left_out[0]} off the name, or put it into aids"
             )
+
+
+def add_chosen_aids(name: str, model: Any, aids: Sequence[str] | str) -> Any:
+    """The filter ``name`` with the sensors that were chosen; InputError where it takes one of them not, or another."""
+    chosen = standard_tables([aids] if isinstance(aids, str) else aids)
+    refuse_left_out({name: model}, chosen)
+    model = with_aids(model, chosen)
+    if unused := [table.name for table in chosen if table not in find_tables(model)]:
+        raise InputError(
+            f"aids: model={name} has no vehicle constraints and takes no {unused[0]}; a Kalman filter takes it by its "
+            f"name, model=mbkf15+{unused[0]}"
+        )
+    return model
 
 
 def append_aids(name: str, aids: Iterable[str]) -> str:

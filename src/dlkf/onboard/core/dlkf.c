@@ -44,8 +44,8 @@ void dlkf_open(dlkf *d, const double *lever_arm_b) {
 }
 
 void dlkf_lay(dlkf *d, double t, double step_s) {
-  d->samples.phase_s = isfinite(t) ? t : NAN;
-  d->samples.step_s = step_s > 0 && step_s < EPOCH_S ? step_s : NAN;
+  d->samples.phase_s = isfinite(t) ? t : (double)NAN;
+  d->samples.step_s = step_s > 0 && step_s < EPOCH_S ? step_s : (double)NAN;
   clear(d);
 }
 
@@ -163,12 +163,20 @@ static void run(dlkf *d, int64_t number, int revised) {
   }
 }
 
-/* The fix of a boundary: the latest report of its update interval that the screen takes, or none. */
+static int same_place(const dlkf_report *a, const dlkf_report *b) {
+  return !(a->lat_deg < b->lat_deg || a->lat_deg > b->lat_deg || a->lon_deg < b->lon_deg || a->lon_deg > b->lon_deg ||
+           a->height_m < b->height_m || a->height_m > b->height_m);
+}
+
+/* The fix of a boundary: the latest report of its update interval that the screen takes and that does not repeat the
+ * position before, or none. */
 static void put_fix(dlkf *d, int64_t row) {
   dlkf_fix *fix = &d->fixes[row % DLKF_BOUNDARIES];
   const dlkf_report *x = NULL;
-  for (int k = d->report_count; k-- && !x;)
-    if (report_at(d, k)->used && (int64_t)dlkf_samples_place(&d->samples, report_at(d, k)->t) == row) x = report_at(d, k);
+  for (int k = 0; k < d->report_count; k++) {
+    const dlkf_report *one = report_at(d, k);
+    if (one->used && (int64_t)dlkf_samples_place(&d->samples, one->t) == row && !(x && same_place(x, one))) x = one;
+  }
   if (!x) {
     if (fix->number == row) fix->number = -1;
     return;
@@ -289,7 +297,9 @@ static void close_epochs(dlkf *d, int ended) {
 dlkf_status dlkf_imu(dlkf *d, double t, const double accel[3], const double gyro[3]) {
   d->made = d->given = 0;
   const int64_t spiked = d->samples.spiked;
-  const dlkf_status status = dlkf_samples_take(&d->samples, t, accel, gyro);
+  const double *v = d->last + DLKF_VEL_N;
+  const int moves = d->latest && v[0] * v[0] + v[1] * v[1] + v[2] * v[2] > FROZEN_SPEED_M_S * FROZEN_SPEED_M_S;
+  const dlkf_status status = dlkf_samples_take(&d->samples, t, accel, gyro, moves);
   d->counts[DLKF_SPIKE] += d->samples.spiked - spiked;
   if (status != DLKF_TAKEN) {
     if (!dlkf_samples_lost(&d->samples)) return dlkf_counted(d, status);
@@ -368,7 +378,8 @@ const char *dlkf_says(dlkf_status status) {
       "refused: the stamp is before the last one", "refused: a gap before the stamp", "refused: more samples than the memory holds",
       "refused: no fix", "refused: latitude, longitude or 1-sigma out of range", "refused: not reachable since the last good fix", "refused: too late",
       "refused: ahead of the IMU; both need one clock", "refused: this filter takes no such sensor", "restarted: stamps were inconsistent for a second",
-      "the filter diverged and realigns", "the filter was far from good fixes and realigns", "an isolated spike of the IMU, left out"};
+      "the filter diverged and realigns", "the filter was far from good fixes and realigns", "an isolated spike of the IMU, left out",
+      "refused: the IMU repeats the same sample while the car moves"};
   return (unsigned)status < DLKF_STATUSES ? words[status] : "no such status";
 }
 

@@ -19,7 +19,8 @@
 #include "step.h"
 
 /* Sizes, whole numbers for the compiler's command line: how late a fix or an aid may come, how fast an IMU or a further sensor may be
- * for samples to be kept that long before the first fixes (a faster one is taken, and starts with fewer of them), and
+ * for samples to be kept that long before the first fixes (a faster one is taken, and starts with fewer of them, as long
+ * as those of an update interval fit), and
  * for how long a search for the heading goes on; 0: none, the course of the first motion is the heading. */
 #ifndef DLKF_LATE_S
 #define DLKF_LATE_S 10
@@ -32,6 +33,10 @@
 #endif
 #ifndef DLKF_SEARCH_S
 #define DLKF_SEARCH_S 20
+#endif
+
+#if DLKF_LATE_S < 0 || DLKF_IMU_HZ < 1 || DLKF_AID_HZ < 1 || DLKF_SEARCH_S < 0
+#error DLKF_LATE_S and DLKF_SEARCH_S must be whole numbers from 0 on, DLKF_IMU_HZ and DLKF_AID_HZ from 1 on
 #endif
 
 #define DLKF_KEEP_S (DLKF_LATE_S > 6 ? DLKF_LATE_S : 6)            /* samples before the update intervals are laid */
@@ -51,7 +56,7 @@
 
 /* What became of a sample, a fix or an aid. */
 typedef enum {
-  DLKF_TAKEN,       /* counts from now on, or at the end of its update interval */
+  DLKF_TAKEN,       /* counts from now on; a fix is stored, for the filter at the end of its update interval */
   DLKF_REPLAYED,    /* came late: the filter went back and came again; dlkf_next gives those rows anew */
   DLKF_SUPERSEDED,  /* a later one of the same update interval is there already */
   DLKF_NOT_FINITE,  /* refused: a number is NaN or infinite */
@@ -70,6 +75,7 @@ typedef enum {
   DLKF_DIVERGED,    /* only a count: the state was not finite, so the filter aligns anew */
   DLKF_LOST,        /* only a count: far off ten good fixes in a row, or where no car can be; it aligns anew */
   DLKF_SPIKE,       /* only a count: a sample proved to be an isolated spike, and was left out */
+  DLKF_FROZEN,      /* refused: all six numbers of the IMU have been the same for half a second on a moving car */
   DLKF_STATUSES
 } dlkf_status;
 
@@ -160,6 +166,7 @@ typedef struct {
   double step, longest;   /* in force: usual, and longest that is no gap [s] */
   double t0;              /* of the grid; NAN: not laid yet */
   double astray[2];       /* first and last stamp of a run out of line; NAN: none */
+  double same[6], since[2]; /* the last sample; first and last stamp of its repetitions; NAN: none */
   int64_t epochs;         /* closed */
   int64_t spiked;         /* samples that proved to be spikes */
   dlkf_spikes spikes;
@@ -193,6 +200,10 @@ typedef struct {
   int64_t counts[DLKF_STATUSES];
   double work[DLKF_WORK];
 } dlkf;
+
+#if DLKF_RAW < DLKF_SAMPLES || DLKF_KEEP_S * DLKF_RATE_MILLIHZ < DLKF_SAMPLES * 1000
+#error DLKF_IMU_HZ and DLKF_LATE_S leave no room for the samples of an update interval
+#endif
 
 #if DLKF_WORK < DLKF_EARLY
 #error DLKF_EARLY is more than there is room for
@@ -255,11 +266,12 @@ const char *dlkf_waits_for(dlkf_waiting waiting);
 extern const size_t dlkf_bytes;
 extern const int dlkf_columns, dlkf_search_seconds;
 
-/* 1 where sizeof(dlkf) bytes that were stored are a filter of this header and may go on, else 0. */
+/* 1 where sizeof(dlkf) bytes that were stored have the layout of this header, else 0. Damage elsewhere is not detected:
+ * store a checksum with them. */
 int dlkf_fits(const dlkf *d);
 
 /* Between the files of the core. */
-dlkf_status dlkf_samples_take(dlkf_samples *s, double t, const double accel[3], const double gyro[3]);
+dlkf_status dlkf_samples_take(dlkf_samples *s, double t, const double accel[3], const double gyro[3], int moves);
 void dlkf_samples_clear(dlkf_samples *s);
 int dlkf_samples_lost(const dlkf_samples *s);
 int dlkf_samples_begin(dlkf_samples *s, const double *t_fix, int count);

@@ -25,18 +25,18 @@ void dlkf_samples_clear(dlkf_samples *s) {
   s->first = s->count = 0;
   s->spiked = 0;
   memset(&s->spikes, 0, sizeof s->spikes);
-  s->astray[0] = s->astray[1] = s->t0 = NAN;
+  s->astray[0] = s->astray[1] = s->t0 = s->since[0] = s->since[1] = NAN;
   s->step = s->step_s;
   s->longest = longest(s->step_s);
   s->epochs = 0;
 }
 
-double dlkf_samples_latest(const dlkf_samples *s) { return s->count ? at(s, s->count - 1)->t : -INFINITY; }
+double dlkf_samples_latest(const dlkf_samples *s) { return s->count ? at(s, s->count - 1)->t : -(double)INFINITY; }
 
 /* Stamp of the last sample that can no longer prove to be a spike. */
 double dlkf_samples_settled(const dlkf_samples *s) {
   const int k = s->count - 1 - s->spikes.undecided;
-  return k < 0 ? -INFINITY : at(s, k)->t;
+  return k < 0 ? -(double)INFINITY : at(s, k)->t;
 }
 
 double dlkf_samples_boundary(const dlkf_samples *s, int64_t number) { return s->t0 + (double)number * EPOCH_S; }
@@ -61,13 +61,26 @@ static dlkf_status out_of_line(dlkf_samples *s, double t, double last) {
   return t > last ? DLKF_GAP : t < last ? DLKF_BACK : DLKF_DOUBLE;
 }
 
-dlkf_status dlkf_samples_take(dlkf_samples *s, double t, const double accel[3], const double gyro[3]) {
+/* Whether all six numbers have been the same for longer than a working sensor repeats them. */
+static int repeats(dlkf_samples *s, const dlkf_sample *x) {
+  int same = x->t >= s->since[1] && x->t - s->since[1] <= s->longest;
+  for (int k = 0; k < 6; k++) same &= x->x[k] >= s->same[k] && x->x[k] <= s->same[k];
+  if (!same) {
+    memcpy(s->same, x->x, sizeof s->same);
+    s->since[0] = x->t;
+  }
+  s->since[1] = x->t;
+  return x->t - s->since[0] > FROZEN_IMU_S;
+}
+
+dlkf_status dlkf_samples_take(dlkf_samples *s, double t, const double accel[3], const double gyro[3], int moves) {
   dlkf_sample sample = {t, {accel[0], accel[1], accel[2], gyro[0], gyro[1], gyro[2]}};
   double sum = t;
   for (int k = 0; k < 6; k++) sum += sample.x[k];
   if (!isfinite(sum)) return DLKF_NOT_FINITE;
   for (int k = 0; k < 6; k++)
     if (fabs(sample.x[k]) > (k < 3 ? FULL_SCALE_ACCEL : FULL_SCALE_GYRO)) return DLKF_IMPLAUSIBLE;
+  if (repeats(s, &sample) && moves) return DLKF_FROZEN;
   const double last = dlkf_samples_latest(s);
   if (s->count && !(last < t && t <= last + s->longest)) return out_of_line(s, t, last);
   if (s->count == DLKF_RAW) {
@@ -237,7 +250,7 @@ static void resampled(const dlkf_samples *s, double begin, double span, int coun
     double total[6] = {0}, products[6] = {0};
     int pieces = 0;
     while (now < limit) {
-      const double knot = early ? opening : k < end ? at(s, k)->t : INFINITY;
+      const double knot = early ? opening : k < end ? at(s, k)->t : (double)INFINITY;
       const double until = knot < limit ? knot : limit;
       double piece[6];
       for (int c = 0; c < 6; c++) piece[c] = force[c] * (until - now);

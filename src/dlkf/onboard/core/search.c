@@ -178,7 +178,7 @@ int dlkf_search_begin(dlkf *d, int64_t number) {
   for (int h = 0; h < DLKF_HEADINGS; h++) {
     const double turn = h < 2 ? h * PI : 2 * PI / RING * (h - 2 + 0.5);
     double Rz[9], C[9], level[9], one[DLKF_START];
-    s->score[h] = h == 0 ? log(1 - REVERSE_PRIOR) : h == 1 ? reverse : -INFINITY;
+    s->score[h] = h == 0 ? log(1 - REVERSE_PRIOR) : h == 1 ? reverse : -(double)INFINITY;
     if (h > 1 && std[8] > COARSE) s->score[h] = log(RING_PRIOR / RING) + (cos(turn) < 0 ? reverse : 0);
     rotation_from_rpy(0, 0, turn, Rz);
     product3(Rz, C_nb, C);

@@ -132,7 +132,7 @@ int main(int argc, char **argv) {
     stamps += imu;
     if (imu) status = dlkf_imu(&filter, x[0], x + 1, x + 4), along_z += status == DLKF_TAKEN ? x[3] : 0, taken += status == DLKF_TAKEN;
     else if (!strncmp(line, "gnss,", 5) && n == 14) status = dlkf_gnss(&filter, x[0], x[1], x[2], x[3], x + 4, x + 7, x[13] >= 0 && x[13] < 100 ? (int)x[13] : -1);
-    else if ((n == 2 || n == 3) && sensor(line) > -2) status = dlkf_aid(&filter, sensor(line), x[0], strncmp(line, "pressure,", 9) ? x[1] : dlkf_pressure_height(x[1]), n == 3 ? x[2] : NAN);
+    else if ((n == 2 || n == 3) && sensor(line) > -2) status = dlkf_aid(&filter, sensor(line), x[0], strncmp(line, "pressure,", 9) ? x[1] : dlkf_pressure_height(x[1]), n == 3 ? x[2] : (double)NAN);
     else {
       if (!strange++) {
         fprintf(stderr, "navigate: line %ld is not a measurement and is ignored: %.*s\n", lines, (int)(strcspn(line, "\n") < 60 ? strcspn(line, "\n") : 60), line);
