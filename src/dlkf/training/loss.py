@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from functools import reduce
+from math import prod
 from typing import Any
 
 import torch
@@ -34,9 +35,9 @@ SMALLEST_VARIANCE = 1e-4  # m²
 class LossConfig:
     """``scale`` [m, m/s, rad]: the error where smooth-L1 turns from square to linear; ``prior`` and
     ``posterior``: how much the states before and after the update count (paper.md 2.8, 4.12); ``position``,
-    ``velocity``, ``attitude``: fixed factors of the three losses, 0 leaves one out (R124). A segment whose position
-    error passes ``diverged_m`` is left out of the batch's loss (paper.md 4.13). ``outage``, ``likelihood``: factors
-    of the two terms above."""
+    ``velocity``, ``attitude``: fixed factors of the three losses beside the adaptive weights, 0 leaves one out (R124).
+    A segment whose position error passes ``diverged_m`` is left out of the batch's loss (paper.md 4.13). ``outage``,
+    ``likelihood``: factors of the two terms above."""
 
     position_scale: float = 1.0
     velocity_scale: float = 0.1
@@ -54,13 +55,18 @@ class LossConfig:
         """:func:`pva_losses` with these settings."""
         return pva_losses(solution, batch, self)
 
+    @property
+    def factors(self) -> dict[str, float]:
+        """The fixed factors of position, velocity and attitude."""
+        return {term: getattr(self, term) for term in TERMS}
+
 
 PAPER_FIELDS = {f.name for f in fields(LossConfig)}  # settings that lie beside _target_ where a preset is the base
 Loss = Callable[[BatchSolution, Batch], Mapping[str, Tensor]]
 
 
 def pva_losses(solution: BatchSolution, batch: Batch, config: LossConfig) -> dict[str, Tensor]:
-    """Mean smooth-L1 of the scaled errors of position, velocity and attitude, unweighted between the three.
+    """Mean smooth-L1 of the scaled errors of position, velocity and attitude, without weights and fixed factors.
 
     Attitude error is log(C_ref Ĉᵀ), never a difference of angles. Epochs without truth do not count; a batch
     without any attitude truth has an attitude loss of 0. Segments that diverged do not count either.
@@ -92,7 +98,7 @@ def pva_losses(solution: BatchSolution, batch: Batch, config: LossConfig) -> dic
             e = error[..., 3 * i : 3 * i + 3] / scale
             each = smooth_l1_loss(e, torch.zeros_like(e), reduction="none")
             value = value + weight / total * torch.where(keep, each, torch.zeros_like(each)).sum() / count
-        losses[term] = getattr(config, term) * value
+        losses[term] = value
     return losses
 
 
@@ -140,6 +146,6 @@ def unit_weights() -> dict[str, float]:
     return dict.fromkeys(TERMS, 1.0)
 
 
-def weighted_loss(losses: Mapping[str, Tensor], weights: dict[str, float]) -> Tensor:
-    """w_p L_p + w_v L_v + w_h L_h (paper eq 9), and the terms that have their own factors."""
-    return reduce(torch.add, (weights.get(term, 1.0) * loss for term, loss in losses.items()))
+def weighted_loss(losses: Mapping[str, Tensor], *weights: Mapping[str, float]) -> Tensor:
+    """w_p L_p + w_v L_v + w_h L_h (paper eq 9), and the terms without weights; several weights of a term multiply."""
+    return reduce(torch.add, (prod(w.get(term, 1.0) for w in weights) * loss for term, loss in losses.items()))
