@@ -20,7 +20,8 @@ from torch import Tensor
 from torch.nn.functional import smooth_l1_loss
 
 from dlkf.base.classes import TARGET, instantiate
-from dlkf.base.settings import settings_from
+from dlkf.base.errors import InputError
+from dlkf.base.settings import Ranged, bounded_field, settings_from
 from dlkf.data.drive import Batch
 from dlkf.filters.integration import BatchSolution
 from dlkf.navigation.state import NavState
@@ -32,24 +33,32 @@ SMALLEST_VARIANCE = 1e-4  # m²
 
 
 @dataclass(frozen=True)
-class LossConfig:
+class LossConfig(Ranged, where="loss", least=0, greatest=1e9):
     """``scale`` [m, m/s, rad]: the error where smooth-L1 turns from square to linear; ``prior`` and
     ``posterior``: how much the states before and after the update count (paper.md 2.8, 4.12); ``position``,
     ``velocity``, ``attitude``: fixed factors of the three losses beside the adaptive weights, 0 leaves one out (R124).
     A segment whose position error passes ``diverged_m`` is left out of the batch's loss (paper.md 4.13). ``outage``,
     ``likelihood``: factors of the two terms above."""
 
-    position_scale: float = 1.0
-    velocity_scale: float = 0.1
-    attitude_scale: float = 0.02
+    position_scale: float = bounded_field(1.0, 1e-6, 1e9)
+    velocity_scale: float = bounded_field(0.1, 1e-6, 1e9)
+    attitude_scale: float = bounded_field(0.02, 1e-6, 1e9)
     prior: float = 1.0
     posterior: float = 1.0
     position: float = 1.0
     velocity: float = 1.0
     attitude: float = 1.0
-    diverged_m: float = 1e4
+    diverged_m: float = bounded_field(1e4, 1e-3, 1e9)
     outage: float = 0.0
     likelihood: float = 0.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not ((self.prior + self.posterior) * sum(self.factors.values()) or self.outage or self.likelihood):
+            raise InputError(
+                "loss: all factors are 0; one of position, velocity and attitude and one of prior and posterior must "
+                "be above 0, or outage or likelihood"
+            )
 
     def __call__(self, solution: BatchSolution, batch: Batch) -> Mapping[str, Tensor]:
         """:func:`pva_losses` with these settings."""

@@ -30,7 +30,7 @@ class TrainerSettings(Ranged, where="trainer"):
     """Epochs, validation and checkpoints, explained in the comments of ``conf/train.yaml``."""
 
     max_epochs: int = bounded_field(500, 1, MANY)
-    gradient_clip: float | None = 1.0
+    gradient_clip: float | None = bounded_field(1.0, 0, MANY)
     validate_every: int = bounded_field(5, 1, MANY)
     checkpoint_every: int = bounded_field(1, 1, MANY)
     monitor: str | None = None
