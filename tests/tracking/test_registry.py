@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import signal
 import socket
@@ -27,7 +28,10 @@ from dlkf.tracking.comparison import choose_best
 from dlkf.tracking.grid import PARENT_RUN, GridParent
 from dlkf.tracking.registry import REQUIRED, check_registration, download_model, log_model, register_model
 from dlkf.tracking.runs import mlflow_module, start_run
+from tests.docs.pages import ROOT
 from tests.shell import PATIENCE_S
+
+TRAINING_PAGE = ROOT / "docs" / "training.md"
 
 
 @pytest.fixture
@@ -84,7 +88,9 @@ def test_the_pyfunc_gives_what_navigate_gives(logged, uri, weights, cars):
     mlflow = mlflow_module()
     mlflow.set_tracking_uri(uri)
     model = mlflow.pyfunc.load_model("models:/town@champion")
-    given = model.predict(pd.DataFrame({"dataset": [str(cars)]}))
+    (call,) = re.findall(r"mlflow\.pyfunc\.load_model\(.*?\)\.predict\(.*?\)", TRAINING_PAGE.read_text())
+    given = eval(call.replace("outage@", "town@").replace("data/town", str(cars)))
+    pd.testing.assert_frame_equal(given, model.predict(pd.DataFrame({"dataset": [str(cars)]})))
     drives = load_dataset(cars, rate_hz=50.0, epoch_s=1.0, dtype=torch.float64, reference=False)
     wanted = {r.drive: r.table for r in navigate_drives(drives, load_filter(weights))}
     assert set(given.drive) == set(wanted) and set(given.dataset) == {str(cars)}

@@ -129,7 +129,9 @@ def model_card_text(run) -> str:
     params = run.data.params
     shown = {key: params[key] for key in ("data.datasets", "imu.name", "seed", "trainer.max_epochs") if key in params}
     rows = "\n".join(f"- {key}: `{value}`" for key, value in shown.items())
-    how = "`predict` takes a table of a drive (IMU and GNSS rows), or folders of datasets; see the input example."
+    how = (
+        "`predict` takes a table of a drive (the input example), or folders of datasets, `{'dataset': ['data/town']}`."
+    )
     return f"# {run.info.run_name}\n\nRun `{run.info.run_id}`. {how}\n\n{rows}\n\n{run.data.tags.get(NOTE_TAG, '')}"
 
 
