@@ -19,6 +19,7 @@ import yaml
 
 from dlkf.base.errors import InputError
 from dlkf.base.files import folder_name, is_url, local_copy
+from dlkf.base.own_code import find_own_modules
 from dlkf.base.processes import process_label
 from dlkf.base.signals import delay_signals
 from dlkf.tracking.endings import PROCESS_TAG, close_killed_runs, end_run, mlflow_module, use_store
@@ -168,7 +169,8 @@ class TrackedRun:
     def log_config(self, config: Mapping[str, Any]) -> None:
         """The whole config as ``config.yaml``, and flattened into parameters (those that are not there yet).
 
-        Values longer than MLflow takes are cut in the parameters, never in the file.
+        Values longer than MLflow takes are cut in the parameters, never in the file. The source of a user's own classes
+        in the config goes into ``code/``.
         """
         from mlflow.entities import Param
 
@@ -176,6 +178,8 @@ class TrackedRun:
         new = [Param(k, v) for k, v in flatten_config(config).items() if k not in there]
         self.client.log_batch(self.id, params=new)
         self.client.log_text(self.id, yaml.safe_dump(dict(config), sort_keys=False), "config.yaml")
+        for path, file in find_own_modules(config).items():
+            self.client.log_artifact(self.id, str(file), str(Path("code", path).parent))
 
     def log_dataset(self, folder: Path | str, digest: str, context: str) -> None:
         """A dataset folder with its digest: the Dataset column of the UI."""
