@@ -30,7 +30,14 @@ from dlkf.training.fit import check_fit
 from dlkf.training.processes import is_worker
 from dlkf.training.run_folder import check_digests, run_folder, write_state
 from dlkf.training.settings import TrainSettings
-from dlkf.training.study import key_metrics, list_left_out_drives, note, run_study, train_with_baselines
+from dlkf.training.study import (
+    key_metrics,
+    list_left_out_drives,
+    list_seen_recordings,
+    note,
+    run_study,
+    train_with_baselines,
+)
 
 
 @command("train")
@@ -60,6 +67,8 @@ def main(config: dict[str, Any]) -> None:
     console.print(data.describe())
     for line in list_left_out_drives(settings, data):
         console.print(f"left out: {line}", style="yellow", highlight=False)
+    for line in list_seen_recordings(settings, data):
+        console.print(line, style="yellow", highlight=False)
     if state:
         console.print(f"resuming the unfinished run in {folder}")
     name = run_name(given.name, overrides)

@@ -1,6 +1,7 @@
 """Killed at any moment and started again, training ends with the same weights as if nothing had happened."""
 
 import os
+import re
 import signal
 from contextlib import nullcontext
 
@@ -17,6 +18,7 @@ from dlkf.training.fit import check_fit, fit
 from dlkf.training.module import FilterTraining
 from dlkf.training.run_folder import check_digests, read_state, run_folder, write_state
 from dlkf.training.settings import FitSettings, TrainSettings
+from dlkf.training.study import list_seen_recordings
 from tests.shell import PATIENCE_S, start_fork
 
 
@@ -131,6 +133,15 @@ def test_epochs_of_which_none_is_validated_are_refused_before_any_work(epochs, e
     plan = make_settings(max_epochs=epochs, validate_every=every, best_from_epoch=start)
     with nullcontext() if some else pytest.raises(InputError, match="no epoch would be validated"):
         check_fit(plan)
+
+
+def test_a_random_split_says_that_recordings_of_the_test_were_trained_on(dataset):
+    """As ``dlkf evaluate`` says it of a model."""
+    study = settings_from(TrainSettings, settings(), "").study
+    assert list_seen_recordings(study, data(dataset)) == []
+    shuffled = DriveDataModule([dataset], split="random", length_s=12.0, eval_length_s=18.0)
+    (line,) = list_seen_recordings(study, shuffled)
+    assert re.match(r"dlkf was trained or chosen on (\d+) of these \d+ recordings, which flatters it; data.split", line)
 
 
 def test_run_folder_is_found_again_until_it_is_finished(tmp_path):

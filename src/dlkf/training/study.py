@@ -19,6 +19,7 @@ from dlkf.base.documents import read_yaml
 from dlkf.base.provenance import describe_provenance
 from dlkf.data.datamodule import DriveDataModule
 from dlkf.data.kinds import drive_imus, drive_kinds
+from dlkf.data.splits import SIDES
 from dlkf.data.store import dataset_digest, load_dataset
 from dlkf.evaluation.endurance import (
     OutageErrors,
@@ -37,6 +38,7 @@ from dlkf.evaluation.study import make_results, run_scenes
 from dlkf.evaluation.summary import collect_metrics, describe_verdict, headline
 from dlkf.evaluation.table import ResultTable, all_tables, as_markdown
 from dlkf.filters.build import refuse_smoothed
+from dlkf.filters.card import describe_seen_recordings
 from dlkf.filters.integration import Estimator
 from dlkf.filters.learned_kalman import LearnedKalmanConfig
 from dlkf.filters.saved import LearnedSettings, load_filter, parse_learned_settings
@@ -123,6 +125,7 @@ def run_study(
         more=tables,
         figures=True,
         trained=learned,
+        warnings=list_seen_recordings(settings, data),
         losses=read_losses(folder),
     )
     if gains:
@@ -173,6 +176,14 @@ def list_left_out_drives(settings: StudySettings, data: DriveDataModule) -> list
     """A line for every side on drives that are too short for its segments, at the full length of a curriculum."""
     grown = [c.full_s for c in settings.fit.callbacks if isinstance(c, LengthCurriculum)]
     return data.list_left_out(max(grown, default=data.train_length_s))
+
+
+def list_seen_recordings(settings: StudySettings, data: DriveDataModule) -> list[str]:
+    """A line where recordings of the test were in training or validation too, as with ``data.split=random``."""
+    train, val, test = ({d.group for d in data.drives(side)} for side in SIDES)
+    remedy = "data.split=group holds whole recordings out"
+    seen = len(test & (train | val))
+    return [describe_seen_recordings(settings.fit.model.kind, seen, len(test), remedy)] if seen else []
 
 
 def set_threads(settings: FitSettings) -> None:
