@@ -58,7 +58,7 @@ def main(config: dict[str, Any]) -> None:
     if is_worker():
         train_with_baselines(settings, data, folder)
         return
-    check_fit(settings.fit)
+    check_fit(settings.fit, data)
     if given.scoring.outage is not None:
         drives_that_fit(given.scoring.outage, data.eval_length_s, "data.eval_length_s", "scoring.outage")
     simulate_missing(data.datasets, console)

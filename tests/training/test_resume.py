@@ -128,11 +128,21 @@ def test_other_data_than_the_unfinished_run_began_with_are_refused(dataset, tmp_
 
 
 @pytest.mark.parametrize(("epochs", "every", "start", "some"), [(1, 1, 3, False), (4, 3, 3, False), (6, 3, 3, True)])
-def test_epochs_of_which_none_is_validated_are_refused_before_any_work(epochs, every, start, some):
+def test_epochs_of_which_none_is_validated_are_refused_before_any_work(epochs, every, start, some, dataset):
     """Validated are the 3rd and the 6th of six, of which the latter comes after three."""
     plan = make_settings(max_epochs=epochs, validate_every=every, best_from_epoch=start)
     with nullcontext() if some else pytest.raises(InputError, match="no epoch would be validated"):
-        check_fit(plan)
+        check_fit(plan, data(dataset))
+
+
+def test_outages_that_no_training_segment_has_room_for_are_refused(dataset):
+    """They would switch the training with outages off without a word; segments grow to 12 s."""
+    long = settings()
+    long["callbacks"]["outage"]["duration_s"] = [4.0, 20.0]
+    with pytest.raises(InputError, match=r"4 s without GNSS, before_s=4 and after_s=5 do not fit into .* of 12 s"):
+        check_fit(fit_of(long), data(dataset))
+    long["callbacks"]["outage"]["duration_s"] = [3.0, 20.0]
+    check_fit(fit_of(long), data(dataset))
 
 
 def test_a_random_split_says_that_recordings_of_the_test_were_trained_on(dataset):

@@ -44,9 +44,8 @@ from dlkf.filters.learned_kalman import LearnedKalmanConfig
 from dlkf.filters.saved import LearnedSettings, load_filter, parse_learned_settings
 from dlkf.filters.shipped import shipped_folder, trained_filter
 from dlkf.report.evaluation import write_report
-from dlkf.training.callbacks.curriculum import LengthCurriculum
 from dlkf.training.callbacks.history import read_losses
-from dlkf.training.fit import fit
+from dlkf.training.fit import fit, longest_segment_s
 from dlkf.training.settings import FitSettings, ScoringSettings, StudySettings
 from dlkf.tuning.baselines import Baselines, tune_baselines
 
@@ -174,8 +173,7 @@ def model_on_baseline(model: LearnedSettings, baselines: Baselines) -> LearnedSe
 
 def list_left_out_drives(settings: StudySettings, data: DriveDataModule) -> list[str]:
     """A line for every side on drives that are too short for its segments, at the full length of a curriculum."""
-    grown = [c.full_s for c in settings.fit.callbacks if isinstance(c, LengthCurriculum)]
-    return data.list_left_out(max(grown, default=data.train_length_s))
+    return data.list_left_out(longest_segment_s(settings.fit, data))
 
 
 def list_seen_recordings(settings: StudySettings, data: DriveDataModule) -> list[str]:
