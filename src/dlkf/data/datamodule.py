@@ -16,6 +16,7 @@ from dlkf.data.augmentation import turn_frames
 from dlkf.data.draws import combine_seed
 from dlkf.data.drive import Batch, Drive
 from dlkf.data.masks import BiasLaw, GnssNoise, Outage, add_bias, mask_outage, withhold_fixes
+from dlkf.data.resampling import samples_per_epoch
 from dlkf.data.segments import (
     Segment,
     StartLaw,
@@ -78,6 +79,7 @@ class DriveDataModule(L.LightningDataModule):
             raise InputError(f"dtype={dtype}: must be {' or '.join(DTYPES)}")
         if batch_size < 1:
             raise InputError(f"batch_size={batch_size}: must be ≥ 1")
+        samples_per_epoch(rate_hz, epoch_s)
         self.datasets = [str(d) for d in ([datasets] if isinstance(datasets, (str, Path)) else datasets)]
         self.rate_hz, self.epoch_s, self.dtype = rate_hz, epoch_s, DTYPES[dtype]
         self.split, self.fractions = split, tuple(fractions)
