@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+
 import lightning as L
 import pytest
 import torch
@@ -62,6 +64,14 @@ def test_named_groups_and_their_mistakes(town):
         _module(town, fractions=(0.5, 0.1, 0.1)).setup()
     with pytest.raises(InputError, match="no training segment of 90 s"):
         _module(town, length_s=90).train_segments(0)
+
+
+def test_without_a_reference_the_data_say_so(tmp_path):
+    """Not that the drives are too short."""
+    bare = write_cars(tmp_path / "bare", 6, seconds=20)
+    shutil.rmtree(bare / "reference")
+    with pytest.raises(InputError, match="no drive of .*bare has a reference, and training needs one"):
+        _module(bare).setup()
 
 
 def test_the_papers_split_shuffles_blocks(town):

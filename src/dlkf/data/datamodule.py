@@ -101,6 +101,11 @@ class DriveDataModule(L.LightningDataModule):
             drives += load_dataset(
                 folder, rate_hz=self.rate_hz, epoch_s=self.epoch_s, dtype=self.dtype, progress=self.progress
             )
+        if not any(bool(d.ref_valid.any()) for d in drives):
+            raise InputError(
+                f"no drive of {', '.join(self.datasets)} has a reference, and training needs one: position, velocity "
+                "and attitude of a better system in reference/"
+            )
         if self.gnss_noise is not None:
             drives = [self.gnss_noise.add_noise(d, self.eval_seed) for d in drives]
         self.stack = DriveStack(drives)
