@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from dlkf.base.console import ProgressCallback
-from dlkf.base.errors import InputError
+from dlkf.base.errors import InputError, list_some
 from dlkf.data.augmentation import turn_frames
 from dlkf.data.draws import combine_seed
 from dlkf.data.drive import Batch, Drive
@@ -98,9 +98,15 @@ class DriveDataModule(L.LightningDataModule):
             return
         drives: list[Drive] = []
         for folder in self.datasets:
-            drives += load_dataset(
+            more = load_dataset(
                 folder, rate_hz=self.rate_hz, epoch_s=self.epoch_s, dtype=self.dtype, progress=self.progress
             )
+            before = {d.name: d.imu for d in drives}
+            if twice := [d.name for d in more if d.name in before and torch.equal(d.imu, before[d.name])]:
+                raise InputError(
+                    f"data.datasets: {folder} has drives of another of them: {list_some(twice, 4)}; give one"
+                )
+            drives += more
         if not any(bool(d.ref_valid.any()) for d in drives):
             raise InputError(
                 f"no drive of {', '.join(self.datasets)} has a reference, and training needs one: position, velocity "
