@@ -74,7 +74,7 @@ def main(config: dict[str, Any]) -> None:
     name = run_name(given.name, overrides)
     parent = os.environ.get(PARENT_RUN)
     with start_run(uri, given.name, name, parent_run_id=parent, run_id=state.get("run_id")) as run:
-        write_state(folder, run_id=run.id, data=check_digests(data.datasets, state))
+        write_state(folder, run_id=run.id, **check_digests(data.datasets, config, state))
         run.log_config(config)
         for dataset in data.datasets:
             run.log_dataset(dataset, dataset_digest(dataset), "training")

@@ -4,6 +4,7 @@ import os
 import re
 import signal
 from contextlib import nullcontext
+from importlib import import_module
 
 import pytest
 import torch
@@ -121,10 +122,24 @@ def test_an_unknown_monitor_is_said_clearly(dataset, tmp_path):
 
 @pytest.mark.whole
 def test_other_data_than_the_unfinished_run_began_with_are_refused(dataset, tmp_path):
-    digests = check_digests([str(dataset)], {})
-    assert check_digests([str(dataset)], {"data": digests}) == digests
+    digests = check_digests([str(dataset)], {}, {})
+    assert check_digests([str(dataset)], {}, digests) == digests
     with pytest.raises(InputError, match="resume=false"):
-        check_digests([str(dataset)], {"data": {str(dataset): "0" * 32}})
+        check_digests([str(dataset)], {}, {"data": {str(dataset): "0" * 32}})
+
+
+def test_another_network_of_ones_own_than_the_unfinished_run_began_with_is_refused(tmp_path, monkeypatch):
+    """The configuration names it and stays the same; its module, and what that imports, does not."""
+    monkeypatch.syspath_prepend(str(tmp_path))
+    (tmp_path / "own_sizes.py").write_text("WIDTH = 4\n")
+    (tmp_path / "own_gru.py").write_text("import own_sizes\n")
+    config = {"model": {"network": {"_target_": "own_gru.Gru"}}, "loss": {"_target_": "torch.nn.L1Loss"}}
+    import_module("own_gru")
+    began = check_digests([], config, {})
+    assert list(began["code"]) == ["own_gru.py", "own_sizes.py"] and check_digests([], config, began) == began
+    (tmp_path / "own_sizes.py").write_text("WIDTH = 8\n")
+    with pytest.raises(InputError, match=r"own_sizes.py is not what the unfinished run began with .* old code back"):
+        check_digests([], config, began)
 
 
 @pytest.mark.parametrize(("epochs", "every", "start", "some"), [(1, 1, 3, False), (4, 3, 3, False), (6, 3, 3, True)])
