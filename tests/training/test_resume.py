@@ -19,7 +19,7 @@ from dlkf.training.fit import check_fit, fit
 from dlkf.training.module import FilterTraining
 from dlkf.training.run_folder import check_digests, read_state, run_folder, write_state
 from dlkf.training.settings import FitSettings, TrainSettings
-from dlkf.training.study import list_seen_recordings
+from dlkf.training.study import list_seen_recordings, model_card
 from tests.shell import PATIENCE_S, start_fork
 
 
@@ -167,6 +167,12 @@ def test_a_random_split_says_that_recordings_of_the_test_were_trained_on(dataset
     shuffled = DriveDataModule([dataset], split="random", length_s=12.0, eval_length_s=18.0)
     (line,) = list_seen_recordings(study, shuffled)
     assert re.match(r"dlkf was trained or chosen on (\d+) of these \d+ recordings, which flatters it; data.split", line)
+
+
+def test_the_card_of_a_model_says_that_the_code_was_changed(dataset, monkeypatch):
+    monkeypatch.setattr("dlkf.training.study.repository_commit", lambda: "0123456789+")
+    study = settings_from(TrainSettings, settings(), "").study
+    assert model_card(study, data(dataset), None)["commit"] == "0123456789+"
 
 
 def test_run_folder_is_found_again_until_it_is_finished(tmp_path):

@@ -16,7 +16,7 @@ from lightning.pytorch.loggers import Logger
 
 import dlkf
 from dlkf.base.documents import read_yaml
-from dlkf.base.provenance import describe_provenance
+from dlkf.base.provenance import describe_provenance, repository_commit
 from dlkf.data.datamodule import DriveDataModule
 from dlkf.data.kinds import drive_imus, drive_kinds
 from dlkf.data.splits import SIDES
@@ -231,7 +231,7 @@ def _endurance(
 
 
 def model_card(settings: StudySettings, data: DriveDataModule, run: str | None) -> dict[str, Any]:
-    """What a model was made of: recordings it was trained and chosen on, the data's digests, IMU, run, seeds, version.
+    """What a model was made of: recordings trained and chosen on, data digests, IMU, run, seeds, version, commit.
 
     ``imus`` are those that it was trained on, of a filter that overfits to them (paper.md 4.8; not ``plus``).
     """
@@ -250,6 +250,7 @@ def model_card(settings: StudySettings, data: DriveDataModule, run: str | None) 
         "seed": settings.fit.seed,
         "max_epochs": settings.fit.trainer.max_epochs,
         "dlkf": dlkf.__version__,
+        "commit": repository_commit(),
     }
 
 
