@@ -144,10 +144,17 @@ def test_another_network_of_ones_own_than_the_unfinished_run_began_with_is_refus
 
 @pytest.mark.parametrize(("epochs", "every", "start", "some"), [(1, 1, 3, False), (4, 3, 3, False), (6, 3, 3, True)])
 def test_epochs_of_which_none_is_validated_are_refused_before_any_work(epochs, every, start, some, dataset):
-    """Validated are the 3rd and the 6th of six, of which the latter comes after three."""
+    """Of six the 3rd and the 6th are validated, the latter after three. The error says what would do."""
     plan = make_settings(max_epochs=epochs, validate_every=every, best_from_epoch=start)
-    with nullcontext() if some else pytest.raises(InputError, match="no epoch would be validated"):
+    with nullcontext() if some else pytest.raises(InputError, match="no epoch would be validated") as refused:
         check_fit(plan, data(dataset))
+    if refused is not None:
+        (least,) = re.findall(r"max_epochs=(\d+) is the least", str(refused.value))
+        check_fit(make_settings(max_epochs=int(least), validate_every=every, best_from_epoch=start), data(dataset))
+        with pytest.raises(InputError):
+            check_fit(
+                make_settings(max_epochs=int(least) - 1, validate_every=every, best_from_epoch=start), data(dataset)
+            )
 
 
 def test_outages_that_no_training_segment_has_room_for_are_refused(dataset):

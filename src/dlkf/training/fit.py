@@ -141,9 +141,10 @@ def check_fit(settings: FitSettings, data: DriveDataModule) -> None:
     plan = settings.trainer
     last = plan.max_epochs // plan.validate_every * plan.validate_every
     if last < 1 or last - 1 < plan.best_from_epoch:
+        least = (plan.best_from_epoch // plan.validate_every + 1) * plan.validate_every
         raise InputError(
-            f"no epoch would be validated: trainer.max_epochs={plan.max_epochs} ends before trainer.best_from_epoch="
-            f"{plan.best_from_epoch} and validate_every={plan.validate_every}"
+            f"no epoch would be validated with trainer.max_epochs={plan.max_epochs}, best_from_epoch="
+            f"{plan.best_from_epoch} and validate_every={plan.validate_every}; trainer.max_epochs={least} is the least"
         )
     if settings.finetune:
         trained_filter(settings.finetune)
