@@ -29,7 +29,7 @@ from dlkf.tracking.runs import check_store, lightning_logger, start_run, trackin
 from dlkf.training.fit import check_fit
 from dlkf.training.processes import is_worker
 from dlkf.training.run_folder import check_digests, run_folder, write_state
-from dlkf.training.settings import TrainSettings
+from dlkf.training.settings import TrainSettings, drop_unused
 from dlkf.training.study import (
     key_metrics,
     list_left_out_drives,
@@ -75,7 +75,7 @@ def main(config: dict[str, Any]) -> None:
     parent = os.environ.get(PARENT_RUN)
     with start_run(uri, given.name, name, parent_run_id=parent, run_id=state.get("run_id")) as run:
         write_state(folder, run_id=run.id, **check_digests(data.datasets, config, state))
-        run.log_config(config)
+        run.log_config(drop_unused(config))
         for dataset in data.datasets:
             run.log_dataset(dataset, dataset_digest(dataset), "training")
         logger = lightning_logger(run, given.trainer.monitor)

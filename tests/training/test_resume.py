@@ -15,10 +15,11 @@ from dlkf.base.settings import settings_from
 from dlkf.command.composing import compose_command, configuration_hash
 from dlkf.data.datamodule import DriveDataModule
 from dlkf.data.masks import Outage
+from dlkf.filters.saved import parse_learned_settings
 from dlkf.training.fit import check_fit, fit
 from dlkf.training.module import FilterTraining
 from dlkf.training.run_folder import check_digests, read_state, run_folder, write_state
-from dlkf.training.settings import FitSettings, TrainSettings
+from dlkf.training.settings import FitSettings, TrainSettings, drop_unused
 from dlkf.training.study import list_seen_recordings, model_card
 from tests.shell import PATIENCE_S, start_fork
 
@@ -174,6 +175,18 @@ def test_a_random_split_says_that_recordings_of_the_test_were_trained_on(dataset
     shuffled = DriveDataModule([dataset], split="random", length_s=12.0, eval_length_s=18.0)
     (line,) = list_seen_recordings(study, shuffled)
     assert re.match(r"dlkf was trained or chosen on (\d+) of these \d+ recordings, which flatters it; data.split", line)
+
+
+def test_settings_that_a_network_or_loss_of_ones_own_does_not_take_are_not_logged():
+    """The presets of the paper's lie beside the class; neither parameters nor the model's config.yaml have them."""
+    config = settings()
+    assert drop_unused(config) == config
+    config["loss"] |= {"_target_": "tests.training.test_loss.Late", "scale": 2.0}
+    config["model"]["network"] |= {"_target_": "tests.filters.test_learned.Mean", "width": 8}
+    logged = drop_unused(config)
+    assert logged["loss"] == {"_target_": "tests.training.test_loss.Late", "scale": 2.0}
+    assert not {"lstm_hidden", "dense"} & set(logged["model"]["network"]) and logged["model"]["network"]["width"] == 8
+    assert "lstm_hidden" not in parse_learned_settings(config["model"]).as_dict()["network"]
 
 
 def test_the_card_of_a_model_says_that_the_code_was_changed(dataset, monkeypatch):

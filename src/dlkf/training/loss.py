@@ -70,6 +70,7 @@ class LossConfig(Ranged, where="loss", least=0, greatest=1e9):
         return {term: getattr(self, term) for term in TERMS}
 
 
+LOSS = ("__call__",)  # method of a loss
 PAPER_FIELDS = {f.name for f in fields(LossConfig)}  # settings that lie beside _target_ where a preset is the base
 Loss = Callable[[BatchSolution, Batch], Mapping[str, Tensor]]
 
@@ -146,7 +147,7 @@ def build_loss(values: Mapping[str, Any]) -> Loss:
     found or takes other settings.
     """
     if TARGET in values:
-        return instantiate(values, "loss", ("__call__",), spare=PAPER_FIELDS)
+        return instantiate(values, "loss", LOSS, spare=PAPER_FIELDS)
     return settings_from(LossConfig, values, "loss")
 
 
