@@ -95,7 +95,8 @@ data: {datasets: [data/idea], batch_size: 4, fractions: [0.5, 0.2, 0.3], length_
        eval_outage: {first_s: 10, duration_s: 10}}
 model: {network: {_target_: gru.Gru, width: 24}}
 trainer: {max_epochs: 4, validate_every: 1, best_from_epoch: 1}
-callbacks: {curriculum: {warm_s: 15, full_s: 20, warm_until: 1, full_from: 2}}
+callbacks: {curriculum: {warm_s: 15, full_s: 20, warm_until: 1, full_from: 2},
+            outage: {duration_s: [4, 10], before_s: 5}}
 baselines: {models: [mbkf15, mbkf21_nhc], tune: false, segments: 4}
 scoring: {outage: {first_s: 10, duration_s: 10}, after_s: [], hour: null, injected_bias: null}
 """)

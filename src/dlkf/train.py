@@ -29,8 +29,15 @@ from dlkf.tracking.runs import check_store, lightning_logger, start_run, trackin
 from dlkf.training.fit import check_fit
 from dlkf.training.processes import is_worker
 from dlkf.training.run_folder import check_digests, run_folder, write_state
-from dlkf.training.settings import TrainSettings
-from dlkf.training.study import key_metrics, list_left_out_drives, note, run_study, train_with_baselines
+from dlkf.training.settings import TrainSettings, drop_unused
+from dlkf.training.study import (
+    key_metrics,
+    list_left_out_drives,
+    list_seen_recordings,
+    note,
+    run_study,
+    train_with_baselines,
+)
 
 
 @command("train")
@@ -51,7 +58,7 @@ def main(config: dict[str, Any]) -> None:
     if is_worker():
         train_with_baselines(settings, data, folder)
         return
-    check_fit(settings.fit)
+    check_fit(settings.fit, data)
     if given.scoring.outage is not None:
         drives_that_fit(given.scoring.outage, data.eval_length_s, "data.eval_length_s", "scoring.outage")
     simulate_missing(data.datasets, console)
@@ -60,13 +67,15 @@ def main(config: dict[str, Any]) -> None:
     console.print(data.describe())
     for line in list_left_out_drives(settings, data):
         console.print(f"left out: {line}", style="yellow", highlight=False)
+    for line in list_seen_recordings(settings, data):
+        console.print(line, style="yellow", highlight=False)
     if state:
         console.print(f"resuming the unfinished run in {folder}")
     name = run_name(given.name, overrides)
     parent = os.environ.get(PARENT_RUN)
     with start_run(uri, given.name, name, parent_run_id=parent, run_id=state.get("run_id")) as run:
-        write_state(folder, run_id=run.id, data=check_digests(data.datasets, state))
-        run.log_config(config)
+        write_state(folder, run_id=run.id, **check_digests(data.datasets, config, state))
+        run.log_config(drop_unused(config))
         for dataset in data.datasets:
             run.log_dataset(dataset, dataset_digest(dataset), "training")
         logger = lightning_logger(run, given.trainer.monitor)

@@ -143,6 +143,15 @@ def compose_and_build(primary: str, overrides: list[str]) -> None:
         find_class(settings.data["_target_"], "data._target_", ("setup", "describe"))
 
 
+def test_every_callback_of_a_training_can_be_left_out():
+    """Without the curriculum outages and the choice of weights begin at once."""
+    for name in compose_command("train")["callbacks"]:
+        config = compose_command("train", f"callbacks.{name}=null")
+        start = 0 if name == "curriculum" else config["callbacks"]["curriculum"]["full_from"]
+        assert config["trainer"]["best_from_epoch"] == start
+        assert len(settings_from(TrainSettings, config, "").fit.callbacks) == len(config["callbacks"]) - 1
+
+
 def test_no_file_is_another_s_twin():
     """What several presets share stands once, in one that they name in their defaults."""
     settings = {}

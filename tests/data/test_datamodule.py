@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+
 import lightning as L
 import pytest
 import torch
@@ -35,12 +37,19 @@ def test_no_group_is_on_two_sides(tmp_path):
 
 
 def test_the_same_recording_in_two_datasets_stays_on_one_side(town, tmp_path):
-    other = write_cars(tmp_path / "again", 6, seconds=20)
+    other = write_cars(tmp_path / "again", 6, seconds=21)
     data = _module(town, other)
     for side in ("train", "val", "test"):
         drives = data.drives(side)
         assert len(drives) == 2 * len({d.group for d in drives})
         assert {d.dataset for d in drives} == {"town", "again"}
+
+
+def test_a_drive_that_is_given_twice_is_refused(town, tmp_path):
+    copy = shutil.copytree(town, tmp_path / "copy")
+    for twice in (town, copy):
+        with pytest.raises(InputError, match=rf"data.datasets: {twice} has drives of another of them: car-0, car-1"):
+            _module(town, twice).setup()
 
 
 def test_named_groups_and_their_mistakes(town):
@@ -62,6 +71,14 @@ def test_named_groups_and_their_mistakes(town):
         _module(town, fractions=(0.5, 0.1, 0.1)).setup()
     with pytest.raises(InputError, match="no training segment of 90 s"):
         _module(town, length_s=90).train_segments(0)
+
+
+def test_without_a_reference_the_data_say_so(tmp_path):
+    """Not that the drives are too short."""
+    bare = write_cars(tmp_path / "bare", 6, seconds=20)
+    shutil.rmtree(bare / "reference")
+    with pytest.raises(InputError, match=r"no drive of .*bare has a reference, and training needs one"):
+        _module(bare).setup()
 
 
 def test_the_papers_split_shuffles_blocks(town):

@@ -25,6 +25,7 @@ SMALL = {
         "scoring.outage={first_s:10,duration_s:10}", "baselines.models=[mbkf15]", "baselines.tune=false",
         "baselines.segments=2", "scoring.after_s=[]", "scoring.hour=null",
         "callbacks.curriculum.warm_s=15", "callbacks.curriculum.full_s=20",
+        "callbacks.outage.duration_s=[4,10]", "callbacks.outage.before_s=5",
         "model.network.lstm_hidden=8", "model.network.lstm_layers=1", "model.network.dense=[8,8]",
     ],
 }  # fmt: skip

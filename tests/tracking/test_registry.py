@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import signal
 import socket
@@ -21,13 +22,17 @@ from dlkf.base.errors import InputError
 from dlkf.data.rows import example_drive
 from dlkf.data.schema import drive_file
 from dlkf.data.store import load_dataset
-from dlkf.filters.saved import load_filter
+from dlkf.filters.learned import LearnedConfig, LearnedFilter
+from dlkf.filters.saved import load_filter, save_filter
 from dlkf.running.offline import navigate_drives
 from dlkf.tracking.comparison import choose_best
 from dlkf.tracking.grid import PARENT_RUN, GridParent
 from dlkf.tracking.registry import REQUIRED, check_registration, download_model, log_model, register_model
 from dlkf.tracking.runs import mlflow_module, start_run
+from tests.docs.pages import ROOT
 from tests.shell import PATIENCE_S
+
+TRAINING_PAGE = ROOT / "docs" / "training.md"
 
 
 @pytest.fixture
@@ -84,7 +89,9 @@ def test_the_pyfunc_gives_what_navigate_gives(logged, uri, weights, cars):
     mlflow = mlflow_module()
     mlflow.set_tracking_uri(uri)
     model = mlflow.pyfunc.load_model("models:/town@champion")
-    given = model.predict(pd.DataFrame({"dataset": [str(cars)]}))
+    (call,) = re.findall(r"mlflow\.pyfunc\.load_model\(.*?\)\.predict\(.*?\)", TRAINING_PAGE.read_text())
+    given = eval(call.replace("outage@", "town@").replace("data/town", str(cars)))
+    pd.testing.assert_frame_equal(given, model.predict(pd.DataFrame({"dataset": [str(cars)]})))
     drives = load_dataset(cars, rate_hz=50.0, epoch_s=1.0, dtype=torch.float64, reference=False)
     wanted = {r.drive: r.table for r in navigate_drives(drives, load_filter(weights))}
     assert set(given.drive) == set(wanted) and set(given.dataset) == {str(cars)}
@@ -183,6 +190,36 @@ class Refuse:
 sys.meta_path.insert(0, Refuse())
 assert {{"rich", "hydra", "lightning"}} <= foreign and "torch" not in foreign
 """
+
+
+def test_a_network_of_one_s_own_comes_with_its_model(uri, client, cars, tmp_path, monkeypatch):
+    """Also what its module imports; elsewhere, where the modules are not on the path, the model still loads."""
+    mine = tmp_path / "mine"
+    (mine / "parts").mkdir(parents=True)
+    (mine / "parts" / "sizes.py").write_text("WIDTH = 4\n")
+    (mine / "mean_network.py").write_text(
+        "import torch\nfrom torch import nn\nfrom parts.sizes import WIDTH\n\n\nclass Mean(nn.Module):\n"
+        "    width = WIDTH\n\n    def start(self, batch_size, like):\n        return ()\n\n"
+        "    def forward(self, window, components, memory):\n        return components[:, :WIDTH], memory\n"
+    )
+    names, config = ("mean_network", "parts", "parts.sizes"), {"network": {"_target_": "mean_network.Mean"}}
+    with monkeypatch.context() as here:
+        here.syspath_prepend(str(mine))
+        save_filter(LearnedFilter(LearnedConfig.from_mapping(config)), tmp_path / "best")
+        with start_run(uri, "town", "one") as run:
+            run.log_config({"model": config})
+            log_model(run, tmp_path / "best", register="town", alias="champion")
+        for name in names:
+            del sys.modules[name]
+    assert [a.path for a in client.list_artifacts(run.id, "code")] == ["code/mean_network.py", "code/parts"]
+    shutil.rmtree(mine)
+    mlflow = mlflow_module()
+    mlflow.set_tracking_uri(uri)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    answer = mlflow.pyfunc.load_model("models:/town@champion").predict({"dataset": [str(cars)]})
+    assert len(answer) > 20 and np.isfinite(answer.vel_n).all()
+    for name in names:
+        del sys.modules[name]
 
 
 @pytest.mark.commands

@@ -80,6 +80,15 @@ def test_a_run_holds_what_was_logged(uri, client, tmp_path):
     assert found.info.artifact_uri.startswith(f"file://{tmp_path}/"), "artifacts lie beside the store"
 
 
+def test_a_run_of_changed_code_says_so(uri, client, monkeypatch):
+    """MLflow's own tag is the commit alone. Outside of a clone there is none."""
+    for commit in ("0123456789+", None):
+        monkeypatch.setattr("dlkf.tracking.runs.repository_commit", lambda commit=commit: commit)
+        with open_run(uri) as run:
+            pass
+        assert client.get_run(run.id).data.tags.get("dlkf.commit") == commit
+
+
 def test_a_registered_model_names_its_metrics(uri, client):
     with open_run(uri) as run:
         run.log_metrics({"test/outage@seed2/outage_end_horizontal_m": 3.0, "test/mbkf15+my:Limit/n": 1.0})

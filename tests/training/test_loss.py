@@ -1,6 +1,7 @@
 """The loss: closed form, masks, gradient."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -9,9 +10,12 @@ from dlkf.base.errors import InputError
 from dlkf.filters.build import build_filter
 from dlkf.filters.integration import integrate
 from dlkf.filters.model_based import Ins
+from dlkf.filters.plus import PlusConfig
 from dlkf.navigation.attitude import rotation_from_vector
 from dlkf.navigation.state import NavState
 from dlkf.training.loss import LossConfig, build_loss, likelihood_term, pva_losses, weighted_loss
+from dlkf.training.module import FilterTraining
+from dlkf.training.optimization import OptimizationPlan, OptimizerSettings, SchedulerSettings
 from tests.filters.scene import IMU, scene
 
 
@@ -126,7 +130,22 @@ def test_a_loss_of_one_s_own_takes_its_settings_and_no_others():
 def test_one_of_the_three_losses_can_be_left_out():
     """R124: training without an attitude reference."""
     batch = scene(2, 5)
-    solution = integrate(batch, Ins())
-    whole, without = pva_losses(solution, batch, LossConfig()), pva_losses(solution, batch, LossConfig(attitude=0.0))
-    assert float(without["attitude"]) == 0.0 < float(whole["attitude"])
-    assert float(without["position"]) == float(whole["position"])
+    losses = pva_losses(integrate(batch, Ins()), batch, LossConfig())
+    without = weighted_loss(losses, LossConfig(attitude=0.0).factors)
+    assert float(losses["attitude"]) > 0 and float(without) == float(losses["position"] + losses["velocity"])
+
+
+def test_fixed_factors_multiply_the_adaptive_weights(monkeypatch):
+    """The weights are computed from losses without the factor, else they would divide it out again."""
+    monkeypatch.setattr(FilterTraining, "trainer", SimpleNamespace(global_rank=0, world_size=1))
+    batch, plan = scene(2, 5), OptimizationPlan(OptimizerSettings(1e-3, 1.0, 0.0), SchedulerSettings())
+    logged, totals = [], []
+    for factor in (1.0, 3.0):
+        model = PlusConfig.from_mapping({"network": {"hidden": 8}})
+        training = FilterTraining(model, LossConfig(velocity=factor), plan)
+        training._run, training.log_dict = lambda b: integrate(b, Ins()), lambda values, **_: logged.append(values)
+        training.loss_weights = lambda: {"position": 1.0, "velocity": 2.0, "attitude": 0.5}
+        totals.append(float(training.training_step(batch, 0)))
+    velocity = [float(values["train/velocity_loss"]) for values in logged]
+    assert velocity[0] == velocity[1] > 0
+    assert totals[1] - totals[0] == pytest.approx((3 - 1) * 2.0 * velocity[0], rel=1e-9)

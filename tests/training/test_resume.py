@@ -1,8 +1,10 @@
 """Killed at any moment and started again, training ends with the same weights as if nothing had happened."""
 
 import os
+import re
 import signal
 from contextlib import nullcontext
+from importlib import import_module
 
 import pytest
 import torch
@@ -13,10 +15,12 @@ from dlkf.base.settings import settings_from
 from dlkf.command.composing import compose_command, configuration_hash
 from dlkf.data.datamodule import DriveDataModule
 from dlkf.data.masks import Outage
+from dlkf.filters.saved import parse_learned_settings
 from dlkf.training.fit import check_fit, fit
 from dlkf.training.module import FilterTraining
 from dlkf.training.run_folder import check_digests, read_state, run_folder, write_state
-from dlkf.training.settings import FitSettings, TrainSettings
+from dlkf.training.settings import FitSettings, TrainSettings, drop_unused
+from dlkf.training.study import list_seen_recordings, model_card
 from tests.shell import PATIENCE_S, start_fork
 
 
@@ -119,18 +123,76 @@ def test_an_unknown_monitor_is_said_clearly(dataset, tmp_path):
 
 @pytest.mark.whole
 def test_other_data_than_the_unfinished_run_began_with_are_refused(dataset, tmp_path):
-    digests = check_digests([str(dataset)], {})
-    assert check_digests([str(dataset)], {"data": digests}) == digests
+    digests = check_digests([str(dataset)], {}, {})
+    assert check_digests([str(dataset)], {}, digests) == digests
     with pytest.raises(InputError, match="resume=false"):
-        check_digests([str(dataset)], {"data": {str(dataset): "0" * 32}})
+        check_digests([str(dataset)], {}, {"data": {str(dataset): "0" * 32}})
+
+
+def test_another_network_of_ones_own_than_the_unfinished_run_began_with_is_refused(tmp_path, monkeypatch):
+    """The configuration names it and stays the same; its module, and what that imports, does not."""
+    monkeypatch.syspath_prepend(str(tmp_path))
+    (tmp_path / "own_sizes.py").write_text("WIDTH = 4\n")
+    (tmp_path / "own_gru.py").write_text("import own_sizes\n")
+    config = {"model": {"network": {"_target_": "own_gru.Gru"}}, "loss": {"_target_": "torch.nn.L1Loss"}}
+    import_module("own_gru")
+    began = check_digests([], config, {})
+    assert list(began["code"]) == ["own_gru.py", "own_sizes.py"] and check_digests([], config, began) == began
+    (tmp_path / "own_sizes.py").write_text("WIDTH = 8\n")
+    with pytest.raises(InputError, match=r"own_sizes.py is not what the unfinished run began with .* old code back"):
+        check_digests([], config, began)
 
 
 @pytest.mark.parametrize(("epochs", "every", "start", "some"), [(1, 1, 3, False), (4, 3, 3, False), (6, 3, 3, True)])
-def test_epochs_of_which_none_is_validated_are_refused_before_any_work(epochs, every, start, some):
-    """Validated are the 3rd and the 6th of six, of which the latter comes after three."""
+def test_epochs_of_which_none_is_validated_are_refused_before_any_work(epochs, every, start, some, dataset):
+    """Of six the 3rd and the 6th are validated, the latter after three. The error says what would do."""
     plan = make_settings(max_epochs=epochs, validate_every=every, best_from_epoch=start)
-    with nullcontext() if some else pytest.raises(InputError, match="no epoch would be validated"):
-        check_fit(plan)
+    with nullcontext() if some else pytest.raises(InputError, match="no epoch would be validated") as refused:
+        check_fit(plan, data(dataset))
+    if refused is not None:
+        (least,) = re.findall(r"max_epochs=(\d+) is the least", str(refused.value))
+        check_fit(make_settings(max_epochs=int(least), validate_every=every, best_from_epoch=start), data(dataset))
+        with pytest.raises(InputError):
+            check_fit(
+                make_settings(max_epochs=int(least) - 1, validate_every=every, best_from_epoch=start), data(dataset)
+            )
+
+
+def test_outages_that_no_training_segment_has_room_for_are_refused(dataset):
+    """They would switch the training with outages off without a word; segments grow to 12 s."""
+    long = settings()
+    long["callbacks"]["outage"]["duration_s"] = [4.0, 20.0]
+    with pytest.raises(InputError, match=r"4 s without GNSS, before_s=4 and after_s=5 do not fit into .* of 12 s"):
+        check_fit(fit_of(long), data(dataset))
+    long["callbacks"]["outage"]["duration_s"] = [3.0, 20.0]
+    check_fit(fit_of(long), data(dataset))
+
+
+def test_a_random_split_says_that_recordings_of_the_test_were_trained_on(dataset):
+    """As ``dlkf evaluate`` says it of a model."""
+    study = settings_from(TrainSettings, settings(), "").study
+    assert list_seen_recordings(study, data(dataset)) == []
+    shuffled = DriveDataModule([dataset], split="random", length_s=12.0, eval_length_s=18.0)
+    (line,) = list_seen_recordings(study, shuffled)
+    assert re.match(r"dlkf was trained or chosen on (\d+) of these \d+ recordings, which flatters it; data.split", line)
+
+
+def test_settings_that_a_network_or_loss_of_ones_own_does_not_take_are_not_logged():
+    """The presets of the paper's lie beside the class; neither parameters nor the model's config.yaml have them."""
+    config = settings()
+    assert drop_unused(config) == config
+    config["loss"] |= {"_target_": "tests.training.test_loss.Late", "scale": 2.0}
+    config["model"]["network"] |= {"_target_": "tests.filters.test_learned.Mean", "width": 8}
+    logged = drop_unused(config)
+    assert logged["loss"] == {"_target_": "tests.training.test_loss.Late", "scale": 2.0}
+    assert not {"lstm_hidden", "dense"} & set(logged["model"]["network"]) and logged["model"]["network"]["width"] == 8
+    assert "lstm_hidden" not in parse_learned_settings(config["model"]).as_dict()["network"]
+
+
+def test_the_card_of_a_model_says_that_the_code_was_changed(dataset, monkeypatch):
+    monkeypatch.setattr("dlkf.training.study.repository_commit", lambda: "0123456789+")
+    study = settings_from(TrainSettings, settings(), "").study
+    assert model_card(study, data(dataset), None)["commit"] == "0123456789+"
 
 
 def test_run_folder_is_found_again_until_it_is_finished(tmp_path):

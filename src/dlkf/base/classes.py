@@ -92,6 +92,15 @@ def instantiate(
     return kind(**{k: convert_value(hints.get(k, Any), v, f"{where}.{k}") for k, v in given.items()})
 
 
+def drop_spare(values: Any, where: str, needs: Collection[str], spare: Collection[str]) -> Any:
+    """The settings beside ``_target_`` without the ``spare`` keys that its class does not take; all without a class."""
+    if not isinstance(values, Mapping) or not values.get(TARGET):
+        return values
+    takes = signature(find_class(str(values[TARGET]), f"{where}.{TARGET}", needs)).parameters
+    anything = any(p.kind is Parameter.VAR_KEYWORD for p in takes.values())
+    return {k: v for k, v in values.items() if anything or k in takes or k not in spare}
+
+
 def _hints(kind: Any) -> dict[str, Any]:
     """The types of a constructor's arguments, none where they cannot be read."""
     try:

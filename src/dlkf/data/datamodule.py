@@ -11,11 +11,12 @@ import numpy as np
 import torch
 
 from dlkf.base.console import ProgressCallback
-from dlkf.base.errors import InputError
+from dlkf.base.errors import InputError, list_some
 from dlkf.data.augmentation import turn_frames
 from dlkf.data.draws import combine_seed
 from dlkf.data.drive import Batch, Drive
 from dlkf.data.masks import BiasLaw, GnssNoise, Outage, add_bias, mask_outage, withhold_fixes
+from dlkf.data.resampling import samples_per_epoch
 from dlkf.data.segments import (
     Segment,
     StartLaw,
@@ -78,6 +79,7 @@ class DriveDataModule(L.LightningDataModule):
             raise InputError(f"dtype={dtype}: must be {' or '.join(DTYPES)}")
         if batch_size < 1:
             raise InputError(f"batch_size={batch_size}: must be ≥ 1")
+        samples_per_epoch(rate_hz, epoch_s)
         self.datasets = [str(d) for d in ([datasets] if isinstance(datasets, (str, Path)) else datasets)]
         self.rate_hz, self.epoch_s, self.dtype = rate_hz, epoch_s, DTYPES[dtype]
         self.split, self.fractions = split, tuple(fractions)
@@ -96,8 +98,19 @@ class DriveDataModule(L.LightningDataModule):
             return
         drives: list[Drive] = []
         for folder in self.datasets:
-            drives += load_dataset(
+            more = load_dataset(
                 folder, rate_hz=self.rate_hz, epoch_s=self.epoch_s, dtype=self.dtype, progress=self.progress
+            )
+            before = {d.name: d.imu for d in drives}
+            if twice := [d.name for d in more if d.name in before and torch.equal(d.imu, before[d.name])]:
+                raise InputError(
+                    f"data.datasets: {folder} has drives of another of them: {list_some(twice, 4)}; give one"
+                )
+            drives += more
+        if not any(bool(d.ref_valid.any()) for d in drives):
+            raise InputError(
+                f"no drive of {', '.join(self.datasets)} has a reference, and training needs one: position, velocity "
+                "and attitude of a better system in reference/"
             )
         if self.gnss_noise is not None:
             drives = [self.gnss_noise.add_noise(d, self.eval_seed) for d in drives]

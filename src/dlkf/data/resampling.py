@@ -27,6 +27,7 @@ FARTHEST = 2**62  # boundary: where stamps beyond any clock are put
 # horizontal position [m] and velocity [m/s] 1σ where a source gives none, by NMEA GGA quality
 DEFAULT_STD = {4: (0.02, 0.05), 5: (0.3, 0.1), 2: (1.0, 0.1), 3: (1.0, 0.1), 9: (1.0, 0.1), 1: (2.5, 0.2)}
 VERTICAL_FACTOR = 1.5  # of the default position std
+FASTEST_HZ, LONGEST_S = 10_000.0, 60.0  # of an IMU, of an epoch: beyond these something was mistyped
 
 
 @dataclass(frozen=True)
@@ -66,8 +67,16 @@ def epoch_grid(t_imu: np.ndarray, t_fix: np.ndarray, rate_hz: float, epoch_s: fl
     return SampleGrid(float(t0), epoch_s, epochs, samples)
 
 
+def check_rate(rate_hz: float | None, epoch_s: float | None) -> None:
+    """InputError where one that is given is not above 0, or beyond what there is."""
+    for name, given, most in (("rate_hz", rate_hz, FASTEST_HZ), ("epoch_s", epoch_s, LONGEST_S)):
+        if given is not None and not 0 < given <= most:
+            raise InputError(f"{name} is {given!r}, must be above 0 and at most {most:g}")
+
+
 def samples_per_epoch(rate_hz: float, epoch_s: float) -> int:
-    """Samples in an epoch; InputError if that is no whole number."""
+    """Samples in an epoch; InputError if that is no whole number, or one of the two is out of range."""
+    check_rate(rate_hz, epoch_s)
     samples = round(rate_hz * epoch_s)
     if samples < 1 or abs(samples - rate_hz * epoch_s) > 1e-6:
         near = max(round(epoch_s * rate_hz), 1) / rate_hz

@@ -123,8 +123,12 @@ def select_scored_drives(
             raise InputError("unseen=true leaves no drive: every recording was in the training of one of the models")
         return kept, []
     return list(drives), [
-        f"{name} was trained or chosen on {len(which)} of these {len(groups)} recordings, which flatters it; "
-        "unseen=true leaves them out"
+        describe_seen_recordings(name, len(which), len(groups), "unseen=true leaves them out")
         for name, which in seen.items()
         if which
     ]
+
+
+def describe_seen_recordings(name: str, seen: int, of: int, remedy: str) -> str:
+    """A line for a model that is scored on recordings of its training."""
+    return f"{name} was trained or chosen on {seen} of these {of} recordings, which flatters it; {remedy}"

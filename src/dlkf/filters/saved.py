@@ -12,13 +12,13 @@ from safetensors.torch import load_file, save_file
 
 from dlkf.base.documents import read_yaml
 from dlkf.base.errors import InputError
+from dlkf.data.resampling import check_rate
 from dlkf.filters.card import CARD, read_card
 from dlkf.filters.learned import LearnedConfig, LearnedFilter
 from dlkf.filters.learned_kalman import LearnedKalmanConfig, LearnedKalmanFilter
 from dlkf.filters.plus import PlusConfig, PlusFilter
 
 WEIGHTS, CONFIG = "weights.safetensors", "config.yaml"
-FASTEST_HZ, LONGEST_S = 10_000.0, 60.0  # of an IMU, of an epoch: beyond these something was mistyped
 LearnedSettings = LearnedConfig | PlusConfig
 Learned = LearnedFilter | PlusFilter
 KINDS: Mapping[str, type[LearnedConfig] | type[PlusConfig]] = {
@@ -63,9 +63,7 @@ def choose_grid(
     """
     configs: list[Any] = [getattr(m, "config", None) for m in models]
     own = next(((c.rate_hz, c.epoch_s) for c in configs if hasattr(c, "rate_hz")), (50.0, usual_epoch_s))
-    for name, given, most in (("rate_hz", rate_hz, FASTEST_HZ), ("epoch_s", epoch_s, LONGEST_S)):
-        if given is not None and not 0 < given <= most:
-            raise InputError(f"{name} is {given!r}, must be above 0 and at most {most:g}")
+    check_rate(rate_hz, epoch_s)
     return {"rate_hz": own[0] if rate_hz is None else rate_hz, "epoch_s": own[1] if epoch_s is None else epoch_s}
 
 

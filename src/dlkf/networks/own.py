@@ -15,7 +15,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any
 
-from dlkf.base.classes import TARGET, instantiate, require_attributes
+from dlkf.base.classes import TARGET, drop_spare, instantiate, require_attributes
 from dlkf.networks.cnn_lstm import NetworkConfig
 
 NETWORK = ("start", "forward", "state_dict")  # methods of a network
@@ -33,7 +33,8 @@ class OwnNetwork:
 
     @classmethod
     def from_mapping(cls, values: Mapping[str, Any]) -> OwnNetwork:
-        """From plain values with ``_target_``."""
+        """From plain values with ``_target_``, of which those of the CNN-LSTM are left out if the class lacks them."""
+        values = drop_spare(values, "model.network", NETWORK, PAPER_FIELDS)
         settings = {k: v for k, v in values.items() if k not in (TARGET, "samples")}
         return cls(str(values[TARGET]), values.get("samples"), settings=settings)
 

@@ -56,6 +56,7 @@ def write_report(
     more: Sequence[ResultTable] = (),
     figures: bool,
     trained: str | None = None,
+    warnings: Sequence[str] = (),
     losses: Mapping[str, Sequence[float]] = MappingProxyType({}),
 ) -> list[Path]:
     """Write the whole report into ``out``, all files or none; returns their paths.
@@ -63,7 +64,8 @@ def write_report(
     ``results`` has one entry per kind of data (of scores.of_kind); ``protocol`` is how the
     scores were made, in plain values; ``more`` tables follow those of the results; ``figures``: figures for print as
     well, figures/*.png; ``trained``: the filter with which the answer begins, ``losses``: of its training
-    (:func:`dlkf.report.training.learning_curve`). Raises InputError if ``out`` cannot be written to.
+    (:func:`dlkf.report.training.learning_curve`); ``warnings`` stand beside those on filters that are too sure of
+    themselves. Raises InputError if ``out`` cannot be written to.
     """
     parts = [*all_tables(dataset, results), *more]
     pictures = print_figures(scores, by_time, baseline, protocol.get("reference")) if figures else []
@@ -74,12 +76,14 @@ def write_report(
                 "protocol": protocol,
                 "results": [r.as_dict() for r in results],
                 "tables": [t._asdict() for t in more],
-                "warnings": sigma_warnings(scores),
+                "warnings": [*warnings, *sigma_warnings(scores)],
             }
         ).encode(),
-        "table.md": "\n".join(map(as_markdown, parts)).encode(),
+        "table.md": "\n".join([*map(as_markdown, parts), *(f"**Warning:** {line}\n" for line in warnings)]).encode(),
         "table.csv": as_csv(dataset, results).encode(),
-        "report.html": evaluation_page(dataset, parts, scores, results, protocol, baseline, trained, losses).encode(),
+        "report.html": evaluation_page(
+            dataset, parts, scores, results, protocol, baseline, trained, losses, warnings
+        ).encode(),
         **{f"figures/{name}.png": data for name, data in pictures},
     }
     with write_into(out) as folder:
@@ -118,6 +122,7 @@ def evaluation_page(
     baseline: str | None,
     trained: str | None = None,
     losses: Mapping[str, Sequence[float]] = MappingProxyType({}),
+    warnings: Sequence[str] = (),
 ) -> str:
     """The page: answer, of a training what was ``trained`` first; for every kind of data the table of the outages, map,
     growth, further sensors, every outage; then what is for research: the ``losses`` of the training, errors over time,
@@ -131,7 +136,7 @@ def evaluation_page(
     unused = protocol.get(UNUSED)
     answers += [f"{unused[0].upper()}{unused[1:]}."] if unused else []
     title = f"Training of {trained} and evaluation on {dataset}" if trained else f"Evaluation on {dataset}"
-    page = Page(title, answers, warnings=sigma_warnings(scores))
+    page = Page(title, answers, warnings=[*warnings, *sigma_warnings(scores)])
     first = [t for t in parts if "outage" in t.title or t.title == SENSORS_TITLE]
     for result in results:
         kind = f"{result.kind}: " if many else ""

@@ -1,8 +1,8 @@
 """The code of a logged model: MLflow stores this file and loads it with the weights beside it (no pickle).
 
     model = mlflow.pyfunc.load_model("models:/town@champion")
-    model.predict(rows)                                          # a table of a drive: IMU samples and fixes
-    model.predict(pandas.DataFrame({"dataset": ["data/town"]}))  # folders in the data contract
+    model.predict(rows)                        # a table of a drive: IMU samples and fixes
+    model.predict({"dataset": ["data/town"]})  # folders in the data contract
     # a row per drive and second: columns of solution.parquet
 
 Served by ``mlflow models serve -m models:/town@champion --env-manager local``, it takes the same table as JSON.
@@ -54,7 +54,7 @@ class NavigationFilter(PythonModel):
         grid = choose_grid([self.filter])
         rate_hz, epoch_s = grid["rate_hz"], grid["epoch_s"]
         if "dataset" in given and given["dataset"].notna().any():
-            for folder in given["dataset"].dropna():
+            for folder in given["dataset"].dropna().explode():  # MLflow puts a list of words into one cell
                 options: dict[str, Any] = {"rate_hz": rate_hz, "epoch_s": epoch_s, "reference": False}
                 yield folder, load_dataset(folder, dtype=torch.float64, **options)
             return

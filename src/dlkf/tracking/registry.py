@@ -14,9 +14,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import dlkf
+from dlkf.base.documents import read_yaml
 from dlkf.base.errors import InputError, first_line
+from dlkf.base.own_code import copy_modules, find_own_modules
 from dlkf.data.rows import GNSS_COLUMNS, IMU_COLUMNS, example_drive
-from dlkf.filters.saved import WEIGHTS
+from dlkf.filters.saved import CONFIG, WEIGHTS
 from dlkf.running.solution import COLUMNS
 from dlkf.tracking.endings import use_store
 from dlkf.tracking.runs import (
@@ -53,21 +55,23 @@ def log_model(
 ) -> str:
     """Log a folder of ``weights.safetensors`` and ``config.yaml`` as a model of the active run.
 
-    Stored are :mod:`dlkf.tracking.pyfunc_model`, this package's source and pinned requirements. ``register``
-    makes it a version in the model registry, ``alias`` points there (an alias alone registers under the
-    experiment's name). ``metrics`` stand beside the model in the UI. Returns ``models:/<id>``.
+    Stored are :mod:`dlkf.tracking.pyfunc_model`, this package's source, that of a user's own network and pinned
+    requirements. ``register`` makes it a version in the model registry, ``alias`` points there (an alias alone
+    registers under the experiment's name). ``metrics`` stand beside the model in the UI. Returns ``models:/<id>``.
     """
     mlflow = mlflow_module()
     client = run.client
     if alias and not register:
         register = client.get_experiment(client.get_run(run.id).info.experiment_id).name
     check_registration(register, alias)
-    with _without_bytecode():
+    own = find_own_modules(read_yaml(Path(folder) / CONFIG))
+    with _without_bytecode(), tempfile.TemporaryDirectory() as beside:
+        code = [Path(dlkf.__file__).parent, *copy_modules(own, Path(beside))]
         info = mlflow.pyfunc.log_model(
             name=NAME,
             python_model=str(CODE),
             artifacts={"filter": str(folder)},
-            code_paths=[str(Path(dlkf.__file__).parent)],
+            code_paths=[str(path) for path in code],
             pip_requirements=pin_requirements(),
             signature=signature(),
             input_example=example_drive(),
@@ -129,7 +133,9 @@ def model_card_text(run) -> str:
     params = run.data.params
     shown = {key: params[key] for key in ("data.datasets", "imu.name", "seed", "trainer.max_epochs") if key in params}
     rows = "\n".join(f"- {key}: `{value}`" for key, value in shown.items())
-    how = "`predict` takes a table of a drive (IMU and GNSS rows), or folders of datasets; see the input example."
+    how = (
+        "`predict` takes a table of a drive (the input example), or folders of datasets, `{'dataset': ['data/town']}`."
+    )
     return f"# {run.info.run_name}\n\nRun `{run.info.run_id}`. {how}\n\n{rows}\n\n{run.data.tags.get(NOTE_TAG, '')}"
 
 

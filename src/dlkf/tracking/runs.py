@@ -19,7 +19,9 @@ import yaml
 
 from dlkf.base.errors import InputError
 from dlkf.base.files import folder_name, is_url, local_copy
+from dlkf.base.own_code import find_own_modules
 from dlkf.base.processes import process_label
+from dlkf.base.provenance import repository_commit
 from dlkf.base.signals import delay_signals
 from dlkf.tracking.endings import PROCESS_TAG, close_killed_runs, end_run, mlflow_module, use_store
 
@@ -31,6 +33,7 @@ STORE, ARTIFACTS = "mlflow.db", "mlruns"
 SQLITE = "sqlite:///"
 RUN_ID = re.compile(r"[0-9a-f]{32}")
 PARENT_TAG, NOTE_TAG = "mlflow.parentRunId", "mlflow.note.content"
+COMMIT_TAG = "dlkf.commit"  # with + where files were changed, which MLflow's own mlflow.source.git.commit does not say
 KIND = {"mlflow.experimentKind": "custom_model_development"}  # else the UI shows pages for language models
 KEY_LENGTH, VALUE_LENGTH, NOTE_LENGTH = 250, 6000, 8000  # MLflow's limits
 MONITORS = ("val/outage_end_m", "val/loss")  # what training keeps the best weights by, unless it is given another
@@ -168,7 +171,8 @@ class TrackedRun:
     def log_config(self, config: Mapping[str, Any]) -> None:
         """The whole config as ``config.yaml``, and flattened into parameters (those that are not there yet).
 
-        Values longer than MLflow takes are cut in the parameters, never in the file.
+        Values longer than MLflow takes are cut in the parameters, never in the file. The source of a user's own classes
+        in the config goes into ``code/``.
         """
         from mlflow.entities import Param
 
@@ -176,6 +180,8 @@ class TrackedRun:
         new = [Param(k, v) for k, v in flatten_config(config).items() if k not in there]
         self.client.log_batch(self.id, params=new)
         self.client.log_text(self.id, yaml.safe_dump(dict(config), sort_keys=False), "config.yaml")
+        for path, file in find_own_modules(config).items():
+            self.client.log_artifact(self.id, str(file), str(Path("code", path).parent))
 
     def log_dataset(self, folder: Path | str, digest: str, context: str) -> None:
         """A dataset folder with its digest: the Dataset column of the UI."""
@@ -252,6 +258,7 @@ def start_run(
     with use_store(uri):
         check_store(uri)
         tags = {PROCESS_TAG: process_label()} | ({PARENT_TAG: parent_run_id} if parent_run_id else {})
+        tags |= {COMMIT_TAG: commit} if (commit := repository_commit()) else {}
         try:
             with reachable(uri), delay_signals():
                 client = open_client(uri)

@@ -20,7 +20,9 @@ from dlkf.filters.learned import LearnedFilter
 from dlkf.filters.learned_kalman import LearnedKalmanFilter
 from dlkf.filters.shipped import trained_filter
 from dlkf.training.callbacks.checkpoints import BEST, LAST, BestWeights, ResumePoint
+from dlkf.training.callbacks.curriculum import LengthCurriculum
 from dlkf.training.callbacks.history import LossHistory
+from dlkf.training.callbacks.masking import OutageInjection
 from dlkf.training.callbacks.progress import TrainingProgress
 from dlkf.training.module import FilterTraining
 from dlkf.training.processes import is_worker, join, with_workers
@@ -120,18 +122,29 @@ def warm_start(model: LearnedFilter, data: DriveDataModule, mean_imu_error: Sequ
     model.train(was)
 
 
-def check_fit(settings: FitSettings) -> None:
+def longest_segment_s(settings: FitSettings, data: DriveDataModule) -> float:
+    """Length of the training segments, at the end of a curriculum where there is one [s]."""
+    grown = [c.full_s for c in settings.callbacks if isinstance(c, LengthCurriculum)]
+    return max(grown, default=data.train_length_s)
+
+
+def check_fit(settings: FitSettings, data: DriveDataModule) -> None:
     """What a training would come upon after the tuning, before any work is done for it.
 
-    InputError for weights to begin with or a class that are not there, other settings than it takes, and epochs of
-    which none is validated; Lightning's error for an accelerator that is unknown or not there.
+    InputError for weights to begin with or a class that are not there, other settings than it takes, epochs of
+    which none is validated, and outages longer than the segments; Lightning's error for an accelerator that is unknown
+    or not there.
     """
+    for callback in settings.callbacks:
+        if isinstance(callback, OutageInjection):
+            callback.check_fits(longest_segment_s(settings, data))
     plan = settings.trainer
     last = plan.max_epochs // plan.validate_every * plan.validate_every
     if last < 1 or last - 1 < plan.best_from_epoch:
+        least = (plan.best_from_epoch // plan.validate_every + 1) * plan.validate_every
         raise InputError(
-            f"no epoch would be validated: trainer.max_epochs={plan.max_epochs} ends before trainer.best_from_epoch="
-            f"{plan.best_from_epoch} and validate_every={plan.validate_every}"
+            f"no epoch would be validated with trainer.max_epochs={plan.max_epochs}, best_from_epoch="
+            f"{plan.best_from_epoch} and validate_every={plan.validate_every}; trainer.max_epochs={least} is the least"
         )
     if settings.finetune:
         trained_filter(settings.finetune)

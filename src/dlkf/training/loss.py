@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from functools import reduce
+from math import prod
 from typing import Any
 
 import torch
@@ -19,7 +20,8 @@ from torch import Tensor
 from torch.nn.functional import smooth_l1_loss
 
 from dlkf.base.classes import TARGET, instantiate
-from dlkf.base.settings import settings_from
+from dlkf.base.errors import InputError
+from dlkf.base.settings import Ranged, bounded_field, settings_from
 from dlkf.data.drive import Batch
 from dlkf.filters.integration import BatchSolution
 from dlkf.navigation.state import NavState
@@ -31,36 +33,50 @@ SMALLEST_VARIANCE = 1e-4  # m²
 
 
 @dataclass(frozen=True)
-class LossConfig:
+class LossConfig(Ranged, where="loss", least=0, greatest=1e9):
     """``scale`` [m, m/s, rad]: the error where smooth-L1 turns from square to linear; ``prior`` and
     ``posterior``: how much the states before and after the update count (paper.md 2.8, 4.12); ``position``,
-    ``velocity``, ``attitude``: fixed factors of the three losses, 0 leaves one out (R124). A segment whose position
-    error passes ``diverged_m`` is left out of the batch's loss (paper.md 4.13). ``outage``, ``likelihood``: factors
-    of the two terms above."""
+    ``velocity``, ``attitude``: fixed factors of the three losses beside the adaptive weights, 0 leaves one out (R124).
+    A segment whose position error passes ``diverged_m`` is left out of the batch's loss (paper.md 4.13). ``outage``,
+    ``likelihood``: factors of the two terms above."""
 
-    position_scale: float = 1.0
-    velocity_scale: float = 0.1
-    attitude_scale: float = 0.02
+    position_scale: float = bounded_field(1.0, 1e-6, 1e9)
+    velocity_scale: float = bounded_field(0.1, 1e-6, 1e9)
+    attitude_scale: float = bounded_field(0.02, 1e-6, 1e9)
     prior: float = 1.0
     posterior: float = 1.0
     position: float = 1.0
     velocity: float = 1.0
     attitude: float = 1.0
-    diverged_m: float = 1e4
+    diverged_m: float = bounded_field(1e4, 1e-3, 1e9)
     outage: float = 0.0
     likelihood: float = 0.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not ((self.prior + self.posterior) * sum(self.factors.values()) or self.outage or self.likelihood):
+            raise InputError(
+                "loss: all factors are 0; one of position, velocity and attitude and one of prior and posterior must "
+                "be above 0, or outage or likelihood"
+            )
 
     def __call__(self, solution: BatchSolution, batch: Batch) -> Mapping[str, Tensor]:
         """:func:`pva_losses` with these settings."""
         return pva_losses(solution, batch, self)
 
+    @property
+    def factors(self) -> dict[str, float]:
+        """The fixed factors of position, velocity and attitude."""
+        return {term: getattr(self, term) for term in TERMS}
 
+
+LOSS = ("__call__",)  # method of a loss
 PAPER_FIELDS = {f.name for f in fields(LossConfig)}  # settings that lie beside _target_ where a preset is the base
 Loss = Callable[[BatchSolution, Batch], Mapping[str, Tensor]]
 
 
 def pva_losses(solution: BatchSolution, batch: Batch, config: LossConfig) -> dict[str, Tensor]:
-    """Mean smooth-L1 of the scaled errors of position, velocity and attitude, unweighted between the three.
+    """Mean smooth-L1 of the scaled errors of position, velocity and attitude, without weights and fixed factors.
 
     Attitude error is log(C_ref Ĉᵀ), never a difference of angles. Epochs without truth do not count; a batch
     without any attitude truth has an attitude loss of 0. Segments that diverged do not count either.
@@ -92,7 +108,7 @@ def pva_losses(solution: BatchSolution, batch: Batch, config: LossConfig) -> dic
             e = error[..., 3 * i : 3 * i + 3] / scale
             each = smooth_l1_loss(e, torch.zeros_like(e), reduction="none")
             value = value + weight / total * torch.where(keep, each, torch.zeros_like(each)).sum() / count
-        losses[term] = getattr(config, term) * value
+        losses[term] = value
     return losses
 
 
@@ -131,7 +147,7 @@ def build_loss(values: Mapping[str, Any]) -> Loss:
     found or takes other settings.
     """
     if TARGET in values:
-        return instantiate(values, "loss", ("__call__",), spare=PAPER_FIELDS)
+        return instantiate(values, "loss", LOSS, spare=PAPER_FIELDS)
     return settings_from(LossConfig, values, "loss")
 
 
@@ -140,6 +156,6 @@ def unit_weights() -> dict[str, float]:
     return dict.fromkeys(TERMS, 1.0)
 
 
-def weighted_loss(losses: Mapping[str, Tensor], weights: dict[str, float]) -> Tensor:
-    """w_p L_p + w_v L_v + w_h L_h (paper eq 9), and the terms that have their own factors."""
-    return reduce(torch.add, (weights.get(term, 1.0) * loss for term, loss in losses.items()))
+def weighted_loss(losses: Mapping[str, Tensor], *weights: Mapping[str, float]) -> Tensor:
+    """w_p L_p + w_v L_v + w_h L_h (paper eq 9), and the terms without weights; several weights of a term multiply."""
+    return reduce(torch.add, (prod(w.get(term, 1.0) for w in weights) * loss for term, loss in losses.items()))

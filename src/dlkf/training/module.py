@@ -18,7 +18,7 @@ from dlkf.filters.aids.attach import with_aids
 from dlkf.filters.integration import BatchSolution, integrate
 from dlkf.filters.saved import LearnedSettings, build_learned_filter
 from dlkf.networks.heads import IMU_ERROR_SIZE, INNOVATION_SIZE, STATE_SIZE
-from dlkf.training.loss import Loss, unit_weights, weighted_loss
+from dlkf.training.loss import Loss, LossConfig, unit_weights, weighted_loss
 from dlkf.training.optimization import OptimizationPlan
 from dlkf.training.processes import gather_all
 
@@ -44,6 +44,7 @@ class FilterTraining(L.LightningModule):
         torch.manual_seed(seed)
         self.filter = build_learned_filter(model)
         self.loss = loss
+        self.factors = loss.factors if isinstance(loss, LossConfig) else {}
         self.descent = descent
         self.covariances = getattr(loss, "likelihood", 0.0) > 0
         self.loss_weights: Callable[[], dict[str, float]] = unit_weights
@@ -69,7 +70,7 @@ class FilterTraining(L.LightningModule):
         batch = batch.to(self.device)
         torch.manual_seed(step_seed(self.seed, self.global_step, *([rank] if rank else ())))  # dropout
         losses = self.loss(self._run(batch), batch)
-        total = weighted_loss(losses, self.loss_weights())
+        total = weighted_loss(losses, self.loss_weights(), self.factors)
         values = {f"train/{k}_loss": v.detach() for k, v in losses.items()}
         values["train/loss"] = total.detach()
         self.log_dict(values, on_step=False, on_epoch=True, batch_size=segments, sync_dist=processes > 1)
@@ -103,7 +104,7 @@ class FilterTraining(L.LightningModule):
             last = solution.used.long().cumsum(1).argmax(1)
             self._gains.append(solution.gain[torch.arange(len(last), device=last.device), last][used].double().cpu())
         losses = self.loss(solution, batch)
-        plain = weighted_loss(losses, unit_weights())
+        plain = weighted_loss(losses, self.factors)
         shared = self.trainer.world_size > 1
         self.log("val/loss", plain, on_epoch=True, batch_size=batch.size[0], sync_dist=shared)
 

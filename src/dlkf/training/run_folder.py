@@ -9,6 +9,7 @@ from typing import Any
 
 from dlkf.base.errors import InputError
 from dlkf.base.files import replace_file
+from dlkf.base.own_code import digest_modules, find_own_modules
 from dlkf.data.store import dataset_digest
 
 STATE = "state.json"
@@ -36,16 +37,22 @@ def read_state(folder: Path) -> dict[str, Any]:
     return json.loads(path.read_text()) if path.is_file() else {}
 
 
-def check_digests(datasets: Sequence[str], state: Mapping[str, Any]) -> dict[str, str]:
-    """Digest of every dataset; InputError where an unfinished run began on other data."""
-    digests = {str(d): dataset_digest(d) for d in datasets}
-    for dataset, before in state.get("data", {}).items():
-        if digests.get(dataset) != before:
-            raise InputError(
-                f"{dataset} is not what the unfinished run began with (digest {digests.get(dataset)}, was {before}): "
-                "bring the old data back, or start afresh with resume=false"
-            )
-    return digests
+def check_digests(
+    datasets: Sequence[str], config: Mapping[str, Any], state: Mapping[str, Any]
+) -> dict[str, dict[str, str]]:
+    """Digests of every dataset (``data``) and of every module of a user's that the configuration names (``code``).
+
+    InputError where an unfinished run began with others.
+    """
+    data, code = {str(d): dataset_digest(d) for d in datasets}, digest_modules(find_own_modules(config))
+    for kind, digests in (("data", data), ("code", code)):
+        for name, before in state.get(kind, {}).items():
+            if digests.get(name) != before:
+                raise InputError(
+                    f"{name} is not what the unfinished run began with (digest {digests.get(name)}, was {before}): "
+                    f"bring the old {kind} back, or start afresh with resume=false"
+                )
+    return {"data": data, "code": code}
 
 
 def write_state(folder: Path, **values: Any) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 
 from lightning.pytorch.callbacks import Callback
 
-from dlkf.base.classes import instantiate
+from dlkf.base.classes import drop_spare, instantiate
 from dlkf.base.errors import InputError
 from dlkf.base.settings import Ranged, bounded_field
 from dlkf.data.masks import BiasLaw
@@ -19,7 +19,10 @@ from dlkf.filters.saved import LearnedSettings, parse_learned_settings
 from dlkf.filters.shipped import shipped_folder
 from dlkf.filters.tuning import Tuning
 from dlkf.navigation.imu_errors import ImuSpec, imu_spec
-from dlkf.training.loss import Loss, build_loss
+from dlkf.networks.own import NETWORK
+from dlkf.networks.own import PAPER_FIELDS as NETWORK_FIELDS
+from dlkf.training.loss import LOSS, Loss, build_loss
+from dlkf.training.loss import PAPER_FIELDS as LOSS_FIELDS
 from dlkf.training.optimization import MANY, OptimizationPlan
 
 CALLBACK = ("setup", "on_train_epoch_start", "state_dict")  # of Lightning's methods those that every callback has
@@ -30,7 +33,7 @@ class TrainerSettings(Ranged, where="trainer"):
     """Epochs, validation and checkpoints, explained in the comments of ``conf/train.yaml``."""
 
     max_epochs: int = bounded_field(500, 1, MANY)
-    gradient_clip: float | None = 1.0
+    gradient_clip: float | None = bounded_field(1.0, 0, MANY)
     validate_every: int = bounded_field(5, 1, MANY)
     checkpoint_every: int = bounded_field(1, 1, MANY)
     monitor: str | None = None
@@ -151,3 +154,11 @@ class TrainSettings:
         if isinstance(fit.model, LearnedKalmanConfig) and fit.model.base not in baselines.models:
             baselines = replace(baselines, models=[*baselines.models, fit.model.base])  # its noise is tuned with them
         return StudySettings(self.name, imu_spec(self.imu), fit, baselines, self.scoring)
+
+
+def drop_unused(config: Mapping[str, Any]) -> dict[str, Any]:
+    """``conf/train.yaml`` without what stands beside a network or loss of one's own and its class does not take."""
+    model, loss = dict(config["model"]), drop_spare(config["loss"], "loss", LOSS, LOSS_FIELDS)
+    if "network" in model:
+        model["network"] = drop_spare(model["network"], "model.network", NETWORK, NETWORK_FIELDS)
+    return {**config, "model": model, "loss": loss}

@@ -16,9 +16,10 @@ from lightning.pytorch.loggers import Logger
 
 import dlkf
 from dlkf.base.documents import read_yaml
-from dlkf.base.provenance import describe_provenance
+from dlkf.base.provenance import describe_provenance, repository_commit
 from dlkf.data.datamodule import DriveDataModule
 from dlkf.data.kinds import drive_imus, drive_kinds
+from dlkf.data.splits import SIDES
 from dlkf.data.store import dataset_digest, load_dataset
 from dlkf.evaluation.endurance import (
     OutageErrors,
@@ -37,14 +38,14 @@ from dlkf.evaluation.study import make_results, run_scenes
 from dlkf.evaluation.summary import collect_metrics, describe_verdict, headline
 from dlkf.evaluation.table import ResultTable, all_tables, as_markdown
 from dlkf.filters.build import refuse_smoothed
+from dlkf.filters.card import describe_seen_recordings
 from dlkf.filters.integration import Estimator
 from dlkf.filters.learned_kalman import LearnedKalmanConfig
 from dlkf.filters.saved import LearnedSettings, load_filter, parse_learned_settings
 from dlkf.filters.shipped import shipped_folder, trained_filter
 from dlkf.report.evaluation import write_report
-from dlkf.training.callbacks.curriculum import LengthCurriculum
 from dlkf.training.callbacks.history import read_losses
-from dlkf.training.fit import fit
+from dlkf.training.fit import fit, longest_segment_s
 from dlkf.training.settings import FitSettings, ScoringSettings, StudySettings
 from dlkf.tuning.baselines import Baselines, tune_baselines
 
@@ -123,6 +124,7 @@ def run_study(
         more=tables,
         figures=True,
         trained=learned,
+        warnings=list_seen_recordings(settings, data),
         losses=read_losses(folder),
     )
     if gains:
@@ -171,8 +173,15 @@ def model_on_baseline(model: LearnedSettings, baselines: Baselines) -> LearnedSe
 
 def list_left_out_drives(settings: StudySettings, data: DriveDataModule) -> list[str]:
     """A line for every side on drives that are too short for its segments, at the full length of a curriculum."""
-    grown = [c.full_s for c in settings.fit.callbacks if isinstance(c, LengthCurriculum)]
-    return data.list_left_out(max(grown, default=data.train_length_s))
+    return data.list_left_out(longest_segment_s(settings.fit, data))
+
+
+def list_seen_recordings(settings: StudySettings, data: DriveDataModule) -> list[str]:
+    """A line where recordings of the test were in training or validation too, as with ``data.split=random``."""
+    train, val, test = ({d.group for d in data.drives(side)} for side in SIDES)
+    remedy = "data.split=group holds whole recordings out"
+    seen = len(test & (train | val))
+    return [describe_seen_recordings(settings.fit.model.kind, seen, len(test), remedy)] if seen else []
 
 
 def set_threads(settings: FitSettings) -> None:
@@ -222,7 +231,7 @@ def _endurance(
 
 
 def model_card(settings: StudySettings, data: DriveDataModule, run: str | None) -> dict[str, Any]:
-    """What a model was made of: recordings it was trained and chosen on, the data's digests, IMU, run, seeds, version.
+    """What a model was made of: recordings trained and chosen on, data digests, IMU, run, seeds, version, commit.
 
     ``imus`` are those that it was trained on, of a filter that overfits to them (paper.md 4.8; not ``plus``).
     """
@@ -241,6 +250,7 @@ def model_card(settings: StudySettings, data: DriveDataModule, run: str | None) 
         "seed": settings.fit.seed,
         "max_epochs": settings.fit.trainer.max_epochs,
         "dlkf": dlkf.__version__,
+        "commit": repository_commit(),
     }
 
 

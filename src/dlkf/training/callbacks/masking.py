@@ -55,7 +55,7 @@ class OutageInjection(BatchCallback):
     """One outage of ``duration_s`` (low, high) in every sub-trajectory, after the warm-up (R070, R072; paper.md 4.14).
 
     The outage leaves ``before_s`` seconds with GNSS at the start and ``after_s`` at the end, so that
-    re-convergence is trained too; segments too short for the shortest outage get none.
+    re-convergence is trained too; no longer one is drawn than fits, and segments too short for the shortest get none.
     """
 
     def __init__(
@@ -67,6 +67,15 @@ class OutageInjection(BatchCallback):
     ) -> None:
         self.duration_s = _bounds("callbacks.outage: duration_s", duration_s)
         self.before_s, self.after_s, self.start_epoch = before_s, after_s, start_epoch
+
+    def check_fits(self, length_s: float) -> None:
+        """InputError where not even the longest training segments have room for the shortest outage."""
+        if self.before_s + self.duration_s[0] + self.after_s > length_s + 1e-6:
+            raise InputError(
+                f"callbacks.outage: {self.duration_s[0]:g} s without GNSS, before_s={self.before_s:g} and after_s="
+                f"{self.after_s:g} do not fit into training segments of {length_s:g} s; give shorter ones, or longer "
+                "segments (callbacks.curriculum.full_s, without a curriculum data.length_s)"
+            )
 
     def transform(self, batch: Batch, epoch: int, generator: torch.Generator) -> Batch:
         """Hide the fixes inside the outage."""
