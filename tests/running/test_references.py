@@ -80,6 +80,22 @@ def test_the_reference_is_as_good_as_it_says(world):
     assert all(bool(m.ref_C_eb[m.ref_valid].isfinite().all()) for m in made.drives)
 
 
+@pytest.mark.parametrize("kind", ["smoothed", "gnss"])
+def test_fixes_of_a_frozen_receiver_are_no_reference(world, kind):
+    """The last position for half a minute in motion, with a 1σ of centimetres."""
+    drives, smoother, _ = world
+    speed = drives[0].ref_v_e.norm(dim=-1)
+    first = next(k for k in range(80, 200) if bool((speed[k : k + 30] > 3).all()))
+    rows, frozen = slice(first + 1, first + 30), {}
+    for name in ("gnss_r_e", "gnss_v_e", "gnss_valid"):
+        frozen[name] = getattr(drives[0], name).clone()
+    frozen["gnss_r_e"][rows] = frozen["gnss_r_e"][first]
+    frozen["gnss_valid"][rows, 3:] = False
+    made = make_reference([replace(drives[0], **frozen)], kind, smoother, ALIGN).drives[0]
+    off = (made.ref_r_e - drives[0].ref_r_e).norm(dim=-1)[made.ref_valid & drives[0].ref_valid]
+    assert len(off) > 150 and off.max() < 5.0
+
+
 def test_no_file_is_needed_and_mistakes_are_told(world):
     drives, smoother, _ = world
     with pytest.raises(InputError, match="reference=best is none of file, smoothed, gnss"):
