@@ -24,6 +24,7 @@ from dlkf.navigation.earth import SEMI_MAJOR
 FORCE, UPRIGHT = (7.0, 13.0), 0.7  # m/s², the median specific force; the share of it along −z
 FASTEST_RATE = 20.0  # rad/s: no car turns, and no bump shakes it, that fast for a thousandth of a drive
 DISAGREES, AGREES = 0.4, 0.25  # relative residual of way against velocity
+NOISELESS = 0.2  # of the time in motion that samples repeat
 LEAST_SLOPE = 0.1  # of gyro_z against the course; one that is at its limit in every turn may have 0.3
 UNITS = (  # that velocities may be in, the remedy, m/s per unit
     ("like km/h", "divide them by 3.6", 1 / 3.6),
@@ -305,19 +306,24 @@ def check_dead_axes(imu: Columns, moved: Motion, where: str, frd: bool = True) -
 
 
 def check_frozen(imu: Columns, gnss: Columns, where: str) -> None:
-    """No sample that is the same to the bit for ``FROZEN_IMU_S`` while the car moves."""
+    """No sample that is the same to the bit for ``FROZEN_IMU_S`` while the car moves.
+
+    Samples without noise, of a simulation, repeat for more than ``NOISELESS`` of the time in motion: they may.
+    """
     t, speed = imu["t"], known_speed(stack_columns(gnss, VELOCITY))
     changes = np.zeros(len(t) - 1, bool)
     for column in (*GYRO, *ACCEL):
         changes |= np.diff(imu[column]) != 0
     edges = np.concatenate(([0], np.flatnonzero(changes) + 1, [len(t)]))
     begin, end = t[edges[:-1]], t[edges[1:] - 1]
-    for first, last in zip(begin[long := end - begin > FROZEN_IMU_S], end[long]):
-        if np.interp((first, last), gnss["t"], speed).min() > FROZEN_SPEED_M_S:
-            raise InputError(
-                f"{where}: the same sample from t = {first:.3f} to {last:.3f} while the car moves: a frozen IMU; leave "
-                "these rows out and split the drive there (dlkf.ingest split_gaps=true)"
-            )
+    moves = np.minimum(*(np.interp(x, gnss["t"], speed) for x in (begin, end))) > FROZEN_SPEED_M_S
+    frozen, way = moves & (end - begin > FROZEN_IMU_S), np.interp(t, gnss["t"], speed) > FROZEN_SPEED_M_S
+    if frozen.any() and (end - begin)[frozen].sum() < NOISELESS * np.diff(t)[way[1:]].sum():
+        first, last = begin[frozen][0], end[frozen][0]
+        raise InputError(
+            f"{where}: the same sample from t = {first:.3f} to {last:.3f} while the car moves: a frozen IMU; leave "
+            "these rows out and split the drive there (dlkf.ingest split_gaps=true)"
+        )
 
 
 def _check_handedness(
