@@ -84,3 +84,26 @@ def test_scale_factors_of_the_whole_drive_are_taken_off_its_beginning():
     smoothed = smooth(batch, build_filter("mbkf21", imu))
     off = (smoothed.imu_error - complete)[:, 2].square().mean(0).sqrt()
     assert off[2] < 0.005 and off[3:].max() < 5e-4  # m/s² along gravity, of 0.12 that the factor makes; rad/s
+
+
+class Wandering:
+    """A Kalman filter that says of its positions that the receiver is off by 2 m for long."""
+
+    def __init__(self, kalman: Mbkf) -> None:
+        self.kalman, self.states = kalman, kalman.states
+
+    def begin(self, batch):
+        return self.kalman.begin(batch)
+
+    def step(self, memory, epoch):
+        memory, correction = self.kalman.step(memory, epoch)
+        slow = torch.tensor([4.0] * 3 + [0.0] * 12, dtype=torch.float64)
+        return memory, correction._replace(std=(correction.std.square() + slow).sqrt())
+
+
+def test_what_a_filter_says_beside_its_covariance_is_not_averaged():
+    batch, kalman = scene(4, 40, seed=3), build_filter("mbkf15", IMU)
+    plain, wandering = smooth(batch, kalman), smooth(batch, Wandering(kalman))
+    more = wandering.std.square() - plain.std.square()
+    torch.testing.assert_close(more[..., :3], torch.full_like(more[..., :3], 4.0))
+    assert more[..., 3:].abs().max() < 1e-12 and torch.equal(plain.posterior.p_n, wandering.posterior.p_n)

@@ -71,11 +71,15 @@ def smooth(batch: Batch, estimator: Estimator) -> BatchSolution:
         deltas.append(delta)
         variances.append(P.diagonal(dim1=-2, dim2=-1))
     dx, variance = (torch.stack(x[::-1], 1) for x in (deltas, variances))
+    variance = variance[..., :STATES].clamp_min(0)
+    if filtered.std is not None:  # the slow part of the fixes' errors is in 1σ beside P, and no smoother averages it
+        beside = filtered.std.square() - known.updated.diagonal(dim1=-2, dim2=-1)[..., :STATES]
+        variance = variance + beside.clamp_min(0)
     return replace(
         filtered,
         posterior=NavState(*filtered.posterior).correct(dx[..., PVA]),
         imu_error=filtered.imu_error + dx[..., IMU] + _matrix_part(filtered, dx, batch, estimator),
-        std=variance[..., :STATES].clamp_min(0).sqrt(),
+        std=variance.sqrt(),
     )
 
 
