@@ -11,20 +11,20 @@ import numpy as np
 
 from dlkf.base.angles import wrap_angle
 from dlkf.base.errors import InputError
+from dlkf.data.dead_sensors import check_dead_axes
 from dlkf.data.discovery.clock import ImuSums, Lag, describe_offset, find_lag
 from dlkf.data.discovery.drift import ROUGH_S, compare_ends, find_drifting_pose, find_step
 from dlkf.data.discovery.motion import Motion, find_motion, stretches
 from dlkf.data.discovery.units import compare_climbs, nearest_unit
-from dlkf.data.limits import DEGREE_M, FROZEN_IMU_S, FROZEN_SPEED_M_S, NOWHERE_DEG, known_speed
+from dlkf.data.limits import DEGREE_M, NOWHERE_DEG
 from dlkf.data.readers.units import LENGTH
-from dlkf.data.schema import ACCEL, GYRO, VELOCITY, stack_columns
+from dlkf.data.schema import ACCEL, GYRO, stack_columns
 from dlkf.data.tables import Columns
 from dlkf.navigation.earth import SEMI_MAJOR
 
 FORCE, UPRIGHT = (7.0, 13.0), 0.7  # m/s², the median specific force; the share of it along −z
 FASTEST_RATE = 20.0  # rad/s: no car turns, and no bump shakes it, that fast for a thousandth of a drive
 DISAGREES, AGREES = 0.4, 0.25  # relative residual of way against velocity
-NOISELESS = 0.2  # of the time in motion that samples repeat
 LEAST_SLOPE = 0.1  # of gyro_z against the course; one that is at its limit in every turn may have 0.3
 UNITS = (  # that velocities may be in, the remedy, m/s per unit
     ("like km/h", "divide them by 3.6", 1 / 3.6),
@@ -40,7 +40,6 @@ WORST_PPM = 1e5  # of clocks that both count seconds
 DRIFTED_S = 0.1  # from a drive's first to its last second: worth a line
 SHORTEST_S = 60.0  # of a drive whose drift is observable
 TURNED_DEG = (30.0, 150.0)  # backwards is found by the filters' own search
-MOVING, TURNED, SPEED_CHANGE = 3.0, 1.0, 3.0  # m/s; rad and m/s over a drive that an axis at work must show
 YAW_AGREES, FORCE_DISAGREES, FORCE_AGREES = 0.85, 0.6, 0.85  # correlations with GNSS
 CHUNK_S = 10.0  # way and course are compared over such stretches: metres of GNSS noise do not matter
 ALIKE = 0.9  # correlation of heights with the integral of vel_d
@@ -279,50 +278,6 @@ def check_clocks(imu: Columns, gnss: Columns, where: str) -> None:
             f"{where}: accelerations agree with GNSS if the IMU is turned by {turned:+.0f}° about the vertical (to "
             f"the {'right' if turned > 0 else 'left'}): x must point forward; reader.imu.accel.axes and "
             f"gyro.axes=auto, or {{roll: 0, pitch: 0, yaw: {turned:.0f}}}"
-        )
-
-
-def check_dead_axes(imu: Columns, moved: Motion, where: str, frd: bool = True) -> None:
-    """An axis that never changes although the car turns, brakes and accelerates.
-
-    In the sensor's own axes (``frd=False``) the one that gravity lies on is down, and two are level.
-    """
-    fast = moved.speed > MOVING
-    if fast.sum() < 3:
-        return
-    both = fast[1:] & fast[:-1]
-    turns = np.abs(wrap_angle(np.diff(moved.course)))[both].sum() > TURNED
-    brakes = np.ptp(moved.speed[fast]) > SPEED_CHANGE
-    needs = [("gyro_z", turns, "turns"), ("accel_x", brakes, "brakes"), ("accel_y", turns, "turns")]
-    if not frd:
-        down = int(np.argmax([abs(float(np.median(imu[c]))) for c in ACCEL]))
-        level = [name for k, name in enumerate(ACCEL) if k != down]
-        needs = [(GYRO[down], turns, "turns"), *((name, turns and brakes, "turns and brakes") for name in level)]
-    for name, shown, what in needs:
-        if shown and np.ptp(imu[name]) == 0:
-            raise InputError(
-                f"{where}: {name} is {imu[name][0]:g} in every row though the car {what}: a dead axis, or no data of it"
-            )
-
-
-def check_frozen(imu: Columns, gnss: Columns, where: str) -> None:
-    """No sample that is the same to the bit for ``FROZEN_IMU_S`` while the car moves.
-
-    Samples without noise, of a simulation, repeat for more than ``NOISELESS`` of the time in motion: they may.
-    """
-    t, speed = imu["t"], known_speed(stack_columns(gnss, VELOCITY))
-    changes = np.zeros(len(t) - 1, bool)
-    for column in (*GYRO, *ACCEL):
-        changes |= np.diff(imu[column]) != 0
-    edges = np.concatenate(([0], np.flatnonzero(changes) + 1, [len(t)]))
-    begin, end = t[edges[:-1]], t[edges[1:] - 1]
-    moves = np.minimum(*(np.interp(x, gnss["t"], speed) for x in (begin, end))) > FROZEN_SPEED_M_S
-    frozen, way = moves & (end - begin > FROZEN_IMU_S), np.interp(t, gnss["t"], speed) > FROZEN_SPEED_M_S
-    if frozen.any() and (end - begin)[frozen].sum() < NOISELESS * np.diff(t)[way[1:]].sum():
-        first, last = begin[frozen][0], end[frozen][0]
-        raise InputError(
-            f"{where}: the same sample from t = {first:.3f} to {last:.3f} while the car moves: a frozen IMU; leave "
-            "these rows out and split the drive there (dlkf.ingest split_gaps=true)"
         )
 
 

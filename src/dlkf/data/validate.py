@@ -12,9 +12,10 @@ import pandas as pd
 from dlkf.base.errors import InputError
 from dlkf.data.aid_checks import check_aid
 from dlkf.data.aid_tables import STANDARD, AidTable
+from dlkf.data.dead_sensors import check_frozen
 from dlkf.data.discovery.motion import find_motion
 from dlkf.data.limits import FULL_SCALE, NONE_REFUSED, Refused, screen_fixes, within_full_scale
-from dlkf.data.plausibility import check_clocks, check_frozen, check_gnss_units, check_imu_units, check_turns
+from dlkf.data.plausibility import check_clocks, check_gnss_units, check_imu_units, check_turns
 from dlkf.data.readers.units import DAY_S, GPS_EPOCH_UNIX, WEEK_S
 from dlkf.data.reference_checks import check_attitude, check_same_clock, check_same_place
 from dlkf.data.schema import ACCEL, ATTITUDE, GYRO, POSITION, STD, VELOCITY, stack_columns

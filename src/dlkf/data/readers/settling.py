@@ -12,10 +12,10 @@ import numpy as np
 import pandas as pd
 
 from dlkf.base.errors import InputError
+from dlkf.data.dead_sensors import check_dead_axes
 from dlkf.data.discovery.findings import Finding, Sure, discover, find_accel_unit, find_value
 from dlkf.data.discovery.motion import find_motion
 from dlkf.data.discovery.units import compare_climbs, nearest_unit, speed_factor
-from dlkf.data.plausibility import check_dead_axes
 from dlkf.data.readers import units
 from dlkf.data.readers.contract import gnss_frame, imu_frame, positions
 from dlkf.data.readers.mapping import Mapped
