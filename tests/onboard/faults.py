@@ -258,7 +258,21 @@ FAULTS: dict[str, tuple[Fault, tuple[str, ...]]] = {
     "an IMU's clock 500 ppm fast": (_stamps(lambda t: t * 1.0005), ()),
     "samples at half the rate": (lambda sent: [c for k, c in enumerate(sent) if k % 2 or c.kind != "imu"], ()),
     "a gap of 0.2 s": (_changed("imu", _between(30.1, 30.3), lambda x: []), ()),
-    "a gap of 3 s": (_changed("imu", _between(30.1, 33.1), lambda x: []), ("gap", "restarted")),
+    "a gap of 0.4 s": (_changed("imu", _between(30.12, 30.52), lambda x: []), ("gap", "bridged")),
+    "a gap of 2.9 s": (_changed("imu", _between(30.1, 33.0), lambda x: []), ("gap", "bridged")),
+    "a gap of 4 s": (_changed("imu", _between(30.1, 34.1), lambda x: []), ("gap", "restarted")),
+    "gaps of 0.3 s in every second of four": (
+        _changed("imu", lambda t: 30 < t < 34 and t % 1 > 0.7, lambda x: []), ("bridged",) * 4),
+    "a gap of half a second, late fixes": (
+        lambda sent: _changed("imu", _between(30.1, 30.6), lambda x: [])(_late(3.0)(sent)), ("bridged", "replayed")),
+    "a gap of half a second in which the lost filter ends": (
+        lambda sent: _changed("imu", _between(30.1, 30.6), lambda x: [])(
+            _changed("gnss", lambda t: t < 44, lambda x: _put(x, 1, -x[1]))(sent)), ("gap", "implausible_fix")),
+    "gaps of half a second without fixes": (
+        lambda sent: _changed("imu", lambda t: t > 26 and t % 7 < 0.5, lambda x: [])(
+            _changed("gnss", _between(25.0, 45.0), lambda x: [])(sent)), ("bridged",)),
+    "two samples ahead": (_changed("imu", _at(30.1, 0.015), lambda x: _put(x, 0, x[0] + 1.5)), ("gap",)),
+    "an IMU frozen for 2 s": (_frozen_imu(30.1, 32.1), ("frozen", "gap", "bridged")),
     "an IMU frozen for 5 s": (_frozen_imu(30.1, 35.1), ("frozen", "gap", "restarted")),
     "an IMU frozen for 0.4 s": (_frozen_imu(30.1, 30.5), ()),
     "an IMU that repeats each sample": (_repeated, ()),
@@ -313,8 +327,8 @@ FAULTS: dict[str, tuple[Fault, tuple[str, ...]]] = {
     "damage of all kinds": (_many, ("not_finite", "implausible", "double", "back")),
 }  # fmt: skip
 USUAL = (  # one of each kind, of every day's tests; all of them: pytest -m exports
-    "none", "single samples", "single fixes", "single samples of sensors", "a gap of 0.2 s", "a gap of 3 s",
-    "an IMU frozen for 5 s",
+    "none", "single samples", "single fixes", "single samples of sensors", "a gap of 0.2 s", "a gap of 0.4 s",
+    "a gap of 4 s", "an IMU frozen for 5 s",
     "spikes in the last and the last but one sample of an update interval", "a tenth of the samples missing",
     "clocks set back 50 s", "coarse positions alone, 3 s late", *JUMPS, *JUMPS_LATE, "a first fix 18 s ahead",
     "wheel speeds at 100 Hz, some again after three seconds", "fix stamps that jitter", "sensors 15 s late",

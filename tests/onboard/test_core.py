@@ -18,7 +18,7 @@ from tests.onboard.faults import FAULTS, JUMPS, JUMPS_LATE, USUAL
 from tests.onboard.streams import Trunk, apart, calls, through_core
 
 pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler here")
-OTHERS = "TAKEN", "REPLAYED", "SUPERSEDED", "RESTARTED", "DIVERGED", "LOST", "SPIKE"
+OTHERS = "TAKEN", "REPLAYED", "SUPERSEDED", "RESTARTED", "DIVERGED", "LOST", "SPIKE", "BRIDGED"
 REFUSED = set(Status) - {Status[x] for x in OTHERS}
 ROUNDING = 1e-6  # m, m/s, rad: sums in another order over a minute
 

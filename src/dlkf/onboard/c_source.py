@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import math
 import zlib
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -34,6 +34,7 @@ from dlkf.onboard.functions import (
     START,
     Anchor,
     Begin,
+    Bridge,
     Carry,
     Function,
     Grid,
@@ -46,7 +47,8 @@ from dlkf.onboard.functions import (
 from dlkf.onboard.headings import Headings, heading_functions
 from dlkf.onboard.meanings import describe_column
 from dlkf.onboard.recording import export_mode, record
-from dlkf.running import imu_stream, streaming
+from dlkf.running import bridging, imu_stream, streaming
+from dlkf.running.bridging import can_bridge
 from dlkf.running.reanchoring import can_reanchor
 from dlkf.running.start import LOOKBACK_S, bank, standstill
 
@@ -111,17 +113,19 @@ def write_source(
             functions |= {"start": Begin, "row": Row, "carry": Carry}
             if can_reanchor(layout.like.memory):
                 functions["anchor"] = Anchor
+            if can_bridge(layout.like.memory):
+                functions["bridge"] = Bridge
         modules = {f: kind(estimator, grid, layout).eval() for f, kind in functions.items()}
         done = {f: translate_function(f"dlkf_{f}", module) for f, module in modules.items()}
-    anchor = "" if "anchor" in done else (CORE / "no_anchor.c.in").read_text()
+    without = [(CORE / f"no_{f}.c.in").read_text() for f in ("anchor", "bridge") if f not in done]
     loop = (CORE / "run.c.in").read_text()
-    parts = [write_preamble(), *(x.code for x in done.values()), loop, anchor]
+    parts = [write_preamble(), *(x.code for x in done.values()), loop, *without]
     (folder / "step.c").write_text("\n".join(parts))
     large = "".join(x.weights for x in done.values())
     head = "/* Weights of the filter, made by dlkf.export. */\n#include <math.h>\n#include <stdint.h>\n"
     (folder / "weights.c").write_text(head + large)
     of_search = Headings.none() if loop_alone else _translate_headings(grid.samples, grid.dt)
-    values = _sizes(estimator, layout, grid, name, max(x.work for x in done.values()), "anchor" in done)
+    values = _sizes(estimator, layout, grid, name, max(x.work for x in done.values()), done)
     room = max(int(values["WORK"]), -(-of_search.work // 8) + 2 * of_search.size)
     values |= {"WORK": room, **of_search.sizes(), **_aids(estimator)}
     (folder / "step.h").write_text(_fill((CORE / "step.h.in").read_text(), values))
@@ -160,7 +164,9 @@ def write_preamble() -> str:
     return "\n".join((made, include, FINITE, UNUSED, VECTORS, "", elementary, *twice))
 
 
-def _sizes(estimator: Estimator, layout: Layout, grid: Grid, name: str, work: int, can_anchor: bool) -> dict[str, Any]:
+def _sizes(
+    estimator: Estimator, layout: Layout, grid: Grid, name: str, work: int, done: Container[str]
+) -> dict[str, Any]:
     """What ``step.h`` is filled with."""
     place = {f.name: f.offset for f in layout.fields}
     window_s, columns = alignment.SEARCH.window_s, list_columns(estimator)
@@ -178,7 +184,8 @@ def _sizes(estimator: Estimator, layout: Layout, grid: Grid, name: str, work: in
         "WORK": -(-work // 8) + max(layout.size, 6 * grid.samples),
         "INNOVATION": sum(OUTPUTS[k] for k in ("prior", "posterior", "error", "std")),
         "AT_ORIGIN": place["frame.origin_e"], "AT_AXES": place["frame.C_en"], "AT_HEIGHT": place["frame.height"],
-        "ANCHOR_M": f"{ANCHOR_M[grid.dtype] if can_anchor else 1e12:g}",
+        "ANCHOR_M": f"{ANCHOR_M[grid.dtype] if 'anchor' in done else 1e12:g}",
+        "BRIDGES": int("bridge" in done),
         "FINGERPRINT": f"0x{zlib.crc32(layout_of.encode()):08x}u",
         "STRINGS": ", ".join(f'"{c}"' for c in columns),
         "NAMES": ", ".join(f"DLKF_{c.upper()}" for c in columns),
@@ -211,7 +218,8 @@ def constants() -> str:
         "FULL_SCALE_ACCEL": limits.FULL_SCALE[0], "FULL_SCALE_GYRO": limits.FULL_SCALE[1],
         "LOWEST_M": limits.HEIGHTS_M[0], "HIGHEST_M": limits.HEIGHTS_M[1],
         "ESTIMATE_LOWEST_M": limits.ESTIMATE_HEIGHTS_M[0], "ESTIMATE_HIGHEST_M": limits.ESTIMATE_HEIGHTS_M[1],
-        "ASTRAY_S": imu_stream.ASTRAY_S, "BEFORE": imu_stream.BEFORE, "SETTLE_S": streaming.SETTLE_S,
+        "ASTRAY_S": imu_stream.ASTRAY_S, "USUAL_S": imu_stream.USUAL_S,
+        "LONGEST_BRIDGE_S": bridging.LONGEST_BRIDGE_S, "BEFORE": imu_stream.BEFORE, "SETTLE_S": streaming.SETTLE_S,
         "FIRST_OF_FIXES": streaming.FIRST_OF_FIXES, "FIRST_OF_AIDS": streaming.FIRST_OF_AIDS,
         "ON_BOUNDARY_S": resampling.ON_BOUNDARY_S, "SMALLEST_STD": resampling.SMALLEST_STD,
         "MIN_SPEED": alignment.SEARCH.min_speed, "RATE_AVERAGE_S": alignment.RATE_AVERAGE_S,

@@ -41,12 +41,14 @@ from dlkf.onboard.functions import (
     Carried,
     Grid,
     count_output_numbers,
+    cross_gap,
     make_layout,
     move_anchor,
     pack_fix,
     split_outputs,
 )
 from dlkf.onboard.library import FLAGS, LIBRARY, Library, build, describe_machine, find_compiler
+from dlkf.running.bridging import Stretch, bridge, find_covariance
 from dlkf.running.reanchoring import FrameChange, can_reanchor, reanchor
 
 MANY = 16  # drives from which on torch is faster than C where a network is large: measured with dlkf at 1 and 64
@@ -211,6 +213,19 @@ def _(memory: Vector, change: FrameChange, fresh: Vector) -> Vector:
     f = memory.filter
     x = move_anchor(f.estimator, f.layout.unpack(memory.numbers), f.grid, change)
     return memory._replace(numbers=f.layout.pack(x))
+
+
+@bridge.register
+def _(memory: Vector, stretch: Stretch, fresh: Vector) -> Vector:
+    """The whole memory."""
+    f = memory.filter
+    x = cross_gap(f.estimator, f.layout.unpack(memory.numbers), stretch.end, stretch.seconds, f.grid)
+    return memory._replace(numbers=f.layout.pack(x))
+
+
+@find_covariance.register
+def _(memory: Vector) -> Tensor | None:
+    return find_covariance(memory.filter.layout.unpack(memory.numbers).memory)
 
 
 def compile_filter(estimator: Filter, rate_hz: float, epoch_s: float, whole: bool = False) -> CompiledFilter:

@@ -5,6 +5,7 @@
     carry(memory, imu, share, outputs)    → outputs          the state within the next one
     row(memory, outputs)                  → row           latitude, longitude, …: a row of ``solution.parquet``
     anchor(memory)                     → memory        the tangent frame follows the car
+    bridge(memory, seconds, outputs)      → memory, outputs  the filter goes on after a gap of the IMU
 
 They call the same code as :class:`dlkf.running.streaming.StreamingFilter`, and nothing in them depends on data but
 through tensors, so that they can be recorded. All numbers are float64, the first axis is that of drives.
@@ -30,6 +31,7 @@ from dlkf.navigation.earth import NOMINAL_GRAVITY, TangentFrame, tangent_frame
 from dlkf.navigation.state import NavState
 from dlkf.navigation.strapdown import strapdown
 from dlkf.onboard.carried import Layout
+from dlkf.running.bridging import Stretch, bridge, bridge_std
 from dlkf.running.reanchoring import FrameChange, frame_at, reanchor
 from dlkf.running.solution import COLUMNS, solution_columns
 
@@ -276,6 +278,37 @@ def move_anchor(estimator: Estimator, x: Carried, grid: Grid, change: FrameChang
     change = FrameChange(change.old, change.new.in_precision(grid.dtype))
     fresh = begin_filter(estimator, change.new, state, state.p_n.new_ones(len(state.p_n), 9), x.lever_arm_b, grid)
     return Carried(reanchor(x.memory, change, fresh.memory), state, x.error, change.new, x.lever_arm_b)
+
+
+class Bridge(Function):
+    """(1, K), (1, 3), (1, :data:`OUTPUTS`) → (1, K), (1, :data:`OUTPUTS`): after a stretch with a gap of the IMU.
+
+    The outputs are those of :class:`Carry` over the stretch, the seconds those before, in and after the gap.
+    """
+
+    def example(self) -> tuple[Tensor, ...]:
+        """As in the class."""
+        ones = torch.ones(1, count_output_numbers(self.estimator), dtype=torch.float64)
+        return self.example_memory(), ones[:, :3], ones
+
+    def forward(self, memory: Tensor, seconds: Tensor, outputs: Tensor) -> tuple[Tensor, Tensor]:
+        """As :class:`dlkf.running.epoch_filter.EpochFilter` does."""
+        x, part = self.layout.unpack(memory), split_outputs(outputs)
+        p_n, v_n, C_nb = part["posterior"].split([3, 3, 9], -1)
+        end = NavState(p_n, v_n, C_nb.unflatten(-1, (3, 3)))
+        after = cross_gap(self.estimator, x, end, seconds, self.grid)
+        std = bridge_std(part["std"], x.memory, after.memory)
+        none = {"innovation", "rejected", "used"}
+        part |= {name: torch.zeros_like(part[name]) for name in none} | {"prior": part["posterior"], "std": std}
+        return self.layout.pack(after), torch.cat([part[name].double() for name in (*OUTPUTS, "aids")], -1)
+
+
+def cross_gap(estimator: Estimator, x: Carried, end: NavState, seconds: Tensor, grid: Grid) -> Carried:
+    """Everything at the ``end`` of a stretch with a gap (:class:`dlkf.running.bridging.Stretch`)."""
+    end, begin = NavState(*(e.to(b) for e, b in zip(end, x.state))), x.state
+    fresh = begin_filter(estimator, x.frame, end, end.p_n.new_ones(len(end.p_n), 9), x.lever_arm_b, grid)
+    stretch = Stretch(begin, end, seconds.to(end.p_n), x.frame)
+    return x._replace(memory=bridge(x.memory, stretch, fresh.memory), state=end)
 
 
 def count_fix_numbers(estimator: Any) -> int:

@@ -23,6 +23,8 @@ from dlkf.filters.integration import Estimator, Fix, advance
 from dlkf.navigation.calibration import ImuError
 from dlkf.navigation.earth import TangentFrame
 from dlkf.navigation.state import NavState
+from dlkf.navigation.strapdown import strapdown
+from dlkf.running.bridging import Stretch, bridge, bridge_std
 from dlkf.running.loss import LossWatch, far_off, is_impossible
 from dlkf.running.measurement_buffer import MeasurementBuffer
 from dlkf.running.reanchoring import FrameChange, can_reanchor, frame_at, reanchor
@@ -93,6 +95,7 @@ class EpochFilter:
     def clear(self) -> None:
         """Start over, without any epoch."""
         self.closed: list[Closed] = []
+        self._number = 0  # of the next epoch
         self.running: Running | Search | None = None
         self._first: Batch | None = None  # what the filter began with
         self.latest: Estimate | None = None  # of the last closed epoch
@@ -100,12 +103,38 @@ class EpochFilter:
 
     def close(self, imu: np.ndarray) -> list[Estimate]:
         """One more epoch, of samples (1, M, 6)."""
-        number = self.closed[-1].number + 1 if self.closed else 0
-        self.closed.append(Closed(number, torch.from_numpy(imu).to(self.device)))
+        self.closed.append(Closed(self._number, torch.from_numpy(imu).to(self.device)))
+        self._number += 1
         estimates = self._run(len(self.closed) - 1)
         if len(self.closed) > self._rewind + self._lookback:
             self._buffer.drop(self.closed.pop(0).number)
         return estimates
+
+    def bridge(self, imu: np.ndarray, epochs: int, seconds: tuple[float, float, float]) -> list[Estimate]:
+        """Some epochs of which the samples (1, M, 6) together fill a gap of the IMU, without a measurement.
+
+        ``seconds``: how long it takes before, in and after the gap. Nothing before it can be replayed any more.
+        """
+        for epoch in self.closed:
+            self._buffer.drop(epoch.number)
+        for number in range(self._number, self._number + epochs):
+            self._buffer.drop(number)
+        self.closed, self._number = [], self._number + epochs
+        running, latest = self.running, self.latest
+        if not isinstance(running, Running) or latest is None or self._first is None:  # a late fix has ended it
+            self.running = self.latest = None
+            return []
+        samples, dt = torch.from_numpy(imu).to(self.device), epochs * self._epoch_s / imu.shape[1]
+        end = strapdown(running.state, running.error.correct(samples), dt, running.frame).end
+        times = torch.tensor([seconds], dtype=end.p_n.dtype, device=self.device)
+        stretch = Stretch(running.state, end, times, running.frame)
+        fresh, _ = self._estimator.begin(replace(self._first, frame=running.frame, start=end))
+        memory = bridge(running.memory, stretch, fresh)
+        std = latest.std if latest.std is None else bridge_std(latest.std, running.memory, memory)
+        self.running = running._replace(memory=memory, state=end)
+        t, frame = self._boundary(self._number), running.frame
+        self.latest = replace(latest, t=t, frame=frame, state=end, std=std, gnss_used=False)
+        return [self.latest]
 
     def replay(self, boundary: int) -> list[Estimate]:
         """The filter again from the epoch on that ends at a boundary."""

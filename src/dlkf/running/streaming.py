@@ -13,8 +13,10 @@ solution to rounding, for any order in which fixes arrive:
 * **The start** is the rule of :func:`dlkf.running.start.align` without look-ahead, applied to the epochs as they
   come. Until the car moves under GNSS, and while it is in doubt which way it faces (``doubt``), there are no estimates.
 * **Bad packets** (not finite, out of range, time that runs back, twice the same, too late) are refused with a reason
-  and counted; nothing is raised. Missing IMU samples are bridged as in a log. A gap longer than ``limits`` allows, or
-  a clock that has been set again, is accepted after one second of it: then the filter starts over with an alignment,
+  and counted; nothing is raised. Missing IMU samples are bridged as in a log. Over a gap longer than
+  ``limits`` allows, up to ``LONGEST_BRIDGE_S``, a running filter is carried with a larger covariance, and without a
+  measurement at the end of the epochs that it touches (:mod:`dlkf.running.bridging`). A longer one, or a clock that
+  has been set again, is accepted after one second of it: then the filter starts over with an alignment,
   and with the IMU error that it started from. It also starts over if its state is no longer finite, is that of no
   car, or stays far from fixes that agree with each other (:mod:`dlkf.running.loss`).
 * **Spikes** of the IMU are left out as in a log; an epoch whose last sample may be one closes up to two samples later
@@ -51,6 +53,7 @@ from dlkf.filters.aids.attach import find_tables
 from dlkf.filters.card import warn_slow_drives
 from dlkf.filters.smoother import Filter, SmoothedSolution
 from dlkf.navigation.strapdown import strapdown
+from dlkf.running.bridging import can_bridge
 from dlkf.running.epoch_filter import EpochFilter, Running
 from dlkf.running.fix_history import HELD, FixHistory
 from dlkf.running.imu_stream import ImuStream, Row
@@ -72,6 +75,7 @@ class Status(StrEnum):
     SUPERSEDED = "superseded"  # a later fix of the same epoch is there already
     REFUSED = "refused"  # see the reason
     RESTARTED = "restarted"  # the stream was lost (see the reason) and restarts
+    BRIDGED = "bridged"  # the sample, after a gap (see the reason) over which the filter is carried
 
 
 class Receipt(NamedTuple):
@@ -128,8 +132,9 @@ class StreamingFilter:
         self.estimator, self._rate_hz = estimator, rate_hz
         self._phase_s, self._history_s = phase_s, history_s
         self._samples = ImuStream(
-            rate_hz, epoch_s, step_s=imu_step_s, limits=limits, keep_s=max(history_s, 2 * SETTLE_S), moves=self._moves
-        )
+            rate_hz, epoch_s, step_s=imu_step_s, limits=limits, keep_s=max(history_s, 2 * SETTLE_S), moves=self._moves,
+            runs=self._runs,
+        )  # fmt: skip
         self._rewind = math.ceil(history_s / epoch_s) + 1  # epochs that may be replayed
         self.counts: Counter[str] = Counter()
         self._buffer = MeasurementBuffer(find_tables(estimator))
@@ -188,9 +193,10 @@ class StreamingFilter:
             self._settle()
         if self._samples.spikes != self.counts["spikes"]:
             self.counts["spikes"] = self._samples.spikes
-        if float(t) < self._samples.end - 1e-6:
-            return TAKEN
-        return self._close(ended=False)
+        closed = TAKEN if float(t) < self._samples.end - 1e-6 else self._close(ended=False)
+        if not self._samples.bridged:
+            return closed
+        return self._answer(Status.BRIDGED, self._samples.bridged, closed.estimates)
 
     def finish(self) -> Receipt:
         """Close an epoch that the end of a drive has reached within the loader's slack of half a sample."""
@@ -270,6 +276,11 @@ class StreamingFilter:
         window = strapdown(running.state, running.error.correct(imu), dt, running.frame)
         return replace(latest, t=self._samples.settled, frame=running.frame, state=window.end, gnss_used=False)
 
+    def _runs(self) -> bool:
+        """Whether there is a filter that can go on after a gap of the IMU."""
+        running = self._epochs.running
+        return isinstance(running, Running) and self.latest is not None and can_bridge(running.memory)
+
     def _moves(self) -> bool:
         """Whether the car moved at the end of the last epoch, as far as the filter knows."""
         latest = self._epochs.latest
@@ -303,7 +314,9 @@ class StreamingFilter:
 
     @torch.inference_mode()
     def _close(self, ended: bool) -> Receipt:
-        estimates = [e for imu in self._samples.close_epochs(ended) for e in self._epochs.close(imu)]
+        estimates: list[Estimate] = []
+        for imu, epochs, seconds in self._samples.close_epochs(ended):
+            estimates += self._epochs.close(imu) if seconds is None else self._epochs.bridge(imu, epochs, seconds)
         return Receipt(Status.TAKEN, tuple(estimates))
 
     def _file(self, fix: dict[str, np.ndarray]) -> Receipt:
@@ -347,7 +360,7 @@ class StreamingFilter:
         """Why a measurement cannot count at boundary ``row``, or nothing; the first that can is ``least``."""
         if row < least or max(row - 1, 0) < self._samples.epochs - self._rewind:
             return f"{what} at t = {t:.3f} is more than {self._history_s:g} s late"
-        if row > self._samples.epochs + self._rewind:
+        if row >= self._samples.until + self._rewind:
             return f"{what} at t = {t:.3f} is ahead of the IMU; both need one clock"
         return ""
 

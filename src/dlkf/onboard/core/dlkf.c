@@ -281,10 +281,37 @@ static void settle(dlkf *d) {
   dlkf_aids_file(d);
 }
 
+/* Over update intervals with a gap of the IMU, from their samples together: nothing before can be replayed any more. */
+static void bridge(dlkf *d, const double *imu, int64_t count, const double seconds[3]) {
+  const int64_t number = d->samples.epochs;
+  d->oldest = number;
+  if (d->kind != DLKF_FILTER || !d->latest) { /* a late fix has ended it */
+    d->kind = DLKF_NOTHING;
+    d->latest = 0;
+    return;
+  }
+  const double share = (double)count;
+  double *before = d->work + DLKF_WORK - DLKF_MEMORY, outputs[DLKF_OUTPUTS];
+  dlkf_carry(d->now.filter, imu, &share, d->outputs, outputs, d->work);
+  memcpy(before, d->now.filter, sizeof d->now.filter);
+  dlkf_bridge(before, seconds, outputs, d->now.filter, d->outputs, d->work);
+  double *row = d->rows[d->made++];
+  dlkf_row(d->now.filter, d->outputs, row + DLKF_LAT_DEG, d->work);
+  row[DLKF_T] = dlkf_samples_boundary(&d->samples, number);
+  row[DLKF_REVISED] = 0;
+  memcpy(d->last, row, sizeof d->last);
+}
+
 static void close_epochs(dlkf *d, int ended) {
   for (;;) {
     const int64_t number = d->samples.epochs;
-    if (!dlkf_samples_closed(&d->samples, ended, epoch_at(d, number)->imu)) return;
+    double seconds[3], *imu = epoch_at(d, number)->imu;
+    const int64_t count = dlkf_samples_closed(&d->samples, ended, imu, seconds);
+    if (!count) return;
+    if (!isnan(seconds[1])) {
+      bridge(d, imu, count, seconds);
+      continue;
+    }
     run(d, number, 0);
     if (number + 1 - d->oldest > DLKF_REWIND + DLKF_LOOKBACK) {
       dlkf_fix *fix = &d->fixes[d->oldest % DLKF_BOUNDARIES];
@@ -299,16 +326,18 @@ dlkf_status dlkf_imu(dlkf *d, double t, const double accel[3], const double gyro
   const int64_t spiked = d->samples.spiked;
   const double *v = d->last + DLKF_VEL_N;
   const int moves = d->latest && v[0] * v[0] + v[1] * v[1] + v[2] * v[2] > FROZEN_SPEED_M_S * FROZEN_SPEED_M_S;
-  const dlkf_status status = dlkf_samples_take(&d->samples, t, accel, gyro, moves);
+  const int runs = DLKF_BRIDGES && d->kind == DLKF_FILTER && d->latest;
+  const dlkf_status status = dlkf_samples_take(&d->samples, t, accel, gyro, moves, runs);
   d->counts[DLKF_SPIKE] += d->samples.spiked - spiked;
-  if (status != DLKF_TAKEN) {
+  if (status == DLKF_BRIDGED) (void)dlkf_counted(d, status);
+  else if (status != DLKF_TAKEN) {
     if (!dlkf_samples_lost(&d->samples)) return dlkf_counted(d, status);
     clear(d);
     return dlkf_counted(d, DLKF_RESTARTED);
   }
   if (isnan(d->samples.t0)) settle(d);
   if (!isnan(d->samples.t0)) close_epochs(d, 0);
-  return DLKF_TAKEN;
+  return status;
 }
 
 void dlkf_finish(dlkf *d) {
@@ -379,7 +408,7 @@ const char *dlkf_says(dlkf_status status) {
       "refused: no fix", "refused: latitude, longitude or 1-sigma out of range", "refused: not reachable since the last good fix", "refused: too late",
       "refused: ahead of the IMU; both need one clock", "refused: this filter takes no such sensor", "restarted: stamps were inconsistent for a second",
       "the filter diverged and realigns", "the filter was far from good fixes and realigns", "an isolated spike of the IMU, left out",
-      "refused: the IMU repeats the same sample while the car moves"};
+      "refused: the IMU repeats the same sample while the car moves", "taken after a gap, over which the filter was carried"};
   return (unsigned)status < DLKF_STATUSES ? words[status] : "no such status";
 }
 

@@ -52,6 +52,7 @@
                                                                    /* of a sensor, among which one that comes twice is known */
 #define DLKF_SPIKE_AHEAD 2                                         /* samples after one that decide whether it is a spike */
 #define DLKF_STRETCH 54                                            /* samples that such a decision takes */
+#define DLKF_AFTER_GAP 5                                           /* samples after a gap that show that it is one */
 #define DLKF_HEADINGS 14                                           /* of a search */
 
 /* What became of a sample, a fix or an aid. */
@@ -63,7 +64,7 @@ typedef enum {
   DLKF_IMPLAUSIBLE, /* refused: beyond what an IMU of a car, or any sensor, measures */
   DLKF_DOUBLE,      /* refused: this stamp again */
   DLKF_BACK,        /* refused: the stamp lies before the last sample's */
-  DLKF_GAP,         /* refused: the stamp leaps ahead by more than is bridged */
+  DLKF_GAP,         /* refused: the stamp leaps ahead by more than is interpolated; see DLKF_BRIDGED */
   DLKF_FULL,        /* refused: more samples in an update interval than DLKF_RAW holds */
   DLKF_NO_FIX,      /* refused: quality of no satellite fix, or no position */
   DLKF_OUTSIDE,     /* refused: latitude or longitude outside +-90, +-180 degrees, or a 1-sigma below 0 */
@@ -76,6 +77,8 @@ typedef enum {
   DLKF_LOST,        /* only a count: far off ten good fixes in a row, or where no car can be; it aligns anew */
   DLKF_SPIKE,       /* only a count: a sample proved to be an isolated spike, and was left out */
   DLKF_FROZEN,      /* refused: all six numbers of the IMU have been the same for half a second on a moving car */
+  DLKF_BRIDGED,     /* the fifth sample after a gap of at most three seconds, over which the filter is carried; it counts,
+                     * and so do the four before */
   DLKF_STATUSES
 } dlkf_status;
 
@@ -167,7 +170,12 @@ typedef struct {
   double t0;              /* of the grid; NAN: not laid yet */
   double astray[2];       /* first and last stamp of a run out of line; NAN: none */
   double same[6], since[2]; /* the last sample; first and last stamp of its repetitions; NAN: none */
+  double usual[6], usual_s; /* mean of the last samples, and of how many seconds */
+  double gap[2], missing; /* since the open update interval began: beginning and end of the gap, NAN: none; seconds */
+  dlkf_sample after[DLKF_AFTER_GAP]; /* the first samples of the run out of line */
+  int32_t after_count;
   int64_t epochs;         /* closed */
+  int64_t until;          /* boundary at which the open update interval ends, or those with a gap together */
   int64_t spiked;         /* samples that proved to be spikes */
   dlkf_spikes spikes;
   int32_t first, count;   /* of the ring */
@@ -271,11 +279,11 @@ extern const int dlkf_columns, dlkf_search_seconds;
 int dlkf_fits(const dlkf *d);
 
 /* Between the files of the core. */
-dlkf_status dlkf_samples_take(dlkf_samples *s, double t, const double accel[3], const double gyro[3], int moves);
+dlkf_status dlkf_samples_take(dlkf_samples *s, double t, const double accel[3], const double gyro[3], int moves, int runs);
 void dlkf_samples_clear(dlkf_samples *s);
 int dlkf_samples_lost(const dlkf_samples *s);
 int dlkf_samples_begin(dlkf_samples *s, const double *t_fix, int count);
-int dlkf_samples_closed(dlkf_samples *s, int ended, double *imu);
+int64_t dlkf_samples_closed(dlkf_samples *s, int ended, double *imu, double seconds[3]);
 double dlkf_samples_latest(const dlkf_samples *s);
 double dlkf_samples_settled(const dlkf_samples *s);
 double dlkf_samples_boundary(const dlkf_samples *s, int64_t number);

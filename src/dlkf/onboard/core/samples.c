@@ -29,6 +29,10 @@ void dlkf_samples_clear(dlkf_samples *s) {
   s->step = s->step_s;
   s->longest = longest(s->step_s);
   s->epochs = 0;
+  s->until = 1;
+  s->after_count = 0;
+  s->usual_s = s->missing = 0;
+  s->gap[0] = s->gap[1] = NAN;
 }
 
 double dlkf_samples_latest(const dlkf_samples *s) { return s->count ? at(s, s->count - 1)->t : -(double)INFINITY; }
@@ -46,7 +50,7 @@ double dlkf_samples_place(const dlkf_samples *s, double t) { return ceil((t - s-
 
 /* Whether what counts at a boundary, of which `least` is the first, comes in time. */
 dlkf_status dlkf_samples_timing(const dlkf_samples *s, double place, int least) {
-  if (!(place <= (double)(s->epochs + DLKF_REWIND))) return DLKF_AHEAD;
+  if (!(place < (double)(s->until + DLKF_REWIND))) return DLKF_AHEAD;
   if (place < least || (place > 1 ? place - 1 : 0) < (double)(s->epochs - DLKF_REWIND)) return DLKF_LATE;
   return DLKF_TAKEN;
 }
@@ -54,11 +58,56 @@ dlkf_status dlkf_samples_timing(const dlkf_samples *s, double place, int least) 
 /* Samples out of line have gone on for longer than an accident does: the clock was set, or the gap is real. */
 int dlkf_samples_lost(const dlkf_samples *s) { return s->astray[1] - s->astray[0] >= ASTRAY_S; }
 
-static dlkf_status out_of_line(dlkf_samples *s, double t, double last) {
-  const int follows = s->astray[1] < t && t <= s->astray[1] + s->longest;
-  if (!follows) s->astray[0] = t;
-  s->astray[1] = t;
-  return t > last ? DLKF_GAP : t < last ? DLKF_BACK : DLKF_DOUBLE;
+/* A sample in line; of `usual` it counts as much as it is long. */
+static void append(dlkf_samples *s, const dlkf_sample *x) {
+  const double step = s->count ? x->t - dlkf_samples_latest(s) : s->usual_s;
+  s->usual_s = s->usual_s + step < USUAL_S ? s->usual_s + step : USUAL_S;
+  const double share = s->usual_s > 0 ? step / s->usual_s : 1;
+  for (int k = 0; k < 6; k++) s->usual[k] += share * (x->x[k] - s->usual[k]);
+  s->ring[(s->first + s->count++) % DLKF_RAW] = *x;
+  if (!dlkf_spikes_add(&s->spikes, x->x)) return;
+  for (int k = s->count - 1 - DLKF_SPIKE_AHEAD; k < s->count - 1; k++) s->ring[(s->first + k) % DLKF_RAW] = *at(s, k + 1);
+  s->count--;
+  s->spiked++;
+}
+
+/* Fill the gap up to the samples that have come after it (dlkf.running.bridging); 0 where it is not to be filled. */
+static int fill(dlkf_samples *s, double last) {
+  const double first = s->after[0].t, missing = first - s->step - last;
+  if (isnan(s->t0) || first <= last || s->missing + missing > LONGEST_BRIDGE_S) return 0;
+  const double wanted = rint((first - last) / s->step) - 1;
+  const int count = wanted > 1 ? (int)wanted : 1, known = s->count < DLKF_AFTER_GAP ? s->count : DLKF_AFTER_GAP;
+  if (s->count + count + DLKF_AFTER_GAP > DLKF_RAW) return 0;
+  double mean[2][6] = {{0}};
+  for (int c = 0; c < 6; c++) {
+    for (int k = 0; k < known; k++) mean[0][c] += at(s, s->count - known + k)->x[c] / known;
+    for (int k = 0; k < DLKF_AFTER_GAP; k++) mean[1][c] += s->after[k].x[c] / DLKF_AFTER_GAP;
+  }
+  for (int k = 1; k <= count; k++) {
+    const double share = (double)k / (count + 1);
+    dlkf_sample *x = &s->ring[(s->first + s->count++) % DLKF_RAW];
+    x->t = last + k * ((first - last) / (count + 1));
+    for (int c = 0; c < 6; c++) /* vertical force, roll and pitch rate as usual */
+      x->x[c] = c < 2 || c > 4 ? mean[0][c] + share * (mean[1][c] - mean[0][c]) : s->usual[c];
+  }
+  memset(&s->spikes, 0, sizeof s->spikes);
+  if (isnan(s->gap[0])) s->gap[0] = last;
+  s->gap[1] = first - s->step;
+  s->missing += missing;
+  for (int k = 0; k < DLKF_AFTER_GAP; k++) append(s, &s->after[k]);
+  const int64_t reached = (int64_t)ceil((s->gap[1] - s->t0) / EPOCH_S - 1e-9);
+  if (reached > s->until) s->until = reached;
+  s->astray[0] = s->astray[1] = NAN;
+  return 1;
+}
+
+static dlkf_status out_of_line(dlkf_samples *s, const dlkf_sample *x, double last, int runs) {
+  const int follows = s->astray[1] < x->t && x->t <= s->astray[1] + s->longest;
+  if (!follows) s->astray[0] = x->t, s->after_count = 0;
+  s->astray[1] = x->t;
+  if (s->after_count < DLKF_AFTER_GAP) s->after[s->after_count++] = *x;
+  if (!(x->t > last)) return x->t < last ? DLKF_BACK : DLKF_DOUBLE;
+  return s->after_count == DLKF_AFTER_GAP && runs && fill(s, last) ? DLKF_BRIDGED : DLKF_GAP;
 }
 
 /* Whether all six numbers have been the same for longer than a working sensor repeats them. */
@@ -73,7 +122,7 @@ static int repeats(dlkf_samples *s, const dlkf_sample *x) {
   return x->t - s->since[0] > FROZEN_IMU_S;
 }
 
-dlkf_status dlkf_samples_take(dlkf_samples *s, double t, const double accel[3], const double gyro[3], int moves) {
+dlkf_status dlkf_samples_take(dlkf_samples *s, double t, const double accel[3], const double gyro[3], int moves, int runs) {
   dlkf_sample sample = {t, {accel[0], accel[1], accel[2], gyro[0], gyro[1], gyro[2]}};
   double sum = t;
   for (int k = 0; k < 6; k++) sum += sample.x[k];
@@ -82,18 +131,13 @@ dlkf_status dlkf_samples_take(dlkf_samples *s, double t, const double accel[3], 
     if (fabs(sample.x[k]) > (k < 3 ? FULL_SCALE_ACCEL : FULL_SCALE_GYRO)) return DLKF_IMPLAUSIBLE;
   if (repeats(s, &sample) && moves) return DLKF_FROZEN;
   const double last = dlkf_samples_latest(s);
-  if (s->count && !(last < t && t <= last + s->longest)) return out_of_line(s, t, last);
+  if (s->count && !(last < t && t <= last + s->longest)) return out_of_line(s, &sample, last, runs);
   if (s->count == DLKF_RAW) {
     if (!isnan(s->t0) || t - at(s, 0)->t < EPOCH_S) return DLKF_FULL;
     drop(s);
   }
   s->astray[0] = s->astray[1] = NAN;
-  s->ring[(s->first + s->count++) % DLKF_RAW] = sample;
-  if (dlkf_spikes_add(&s->spikes, sample.x)) {
-    for (int k = s->count - 1 - DLKF_SPIKE_AHEAD; k < s->count - 1; k++) s->ring[(s->first + k) % DLKF_RAW] = *at(s, k + 1);
-    s->count--;
-    s->spiked++;
-  }
+  append(s, &sample);
   if (isnan(s->t0) && t - at(s, 0)->t > DLKF_KEEP_S) drop(s);
   return DLKF_TAKEN;
 }
@@ -268,17 +312,24 @@ static void resampled(const dlkf_samples *s, double begin, double span, int coun
   }
 }
 
-/* The next update interval whose end the samples have reached: 1 and its samples, else 0. Where the stream has ended, to
- * half a sample, and the last are no spikes. */
-int dlkf_samples_closed(dlkf_samples *s, int ended, double *imu) {
+/* How many update intervals have ended that the samples have reached: their samples, and where there is a gap in them (else
+ * NAN) the seconds before, in and after it. Where the stream has ended, to half a sample, and the last are no spikes. */
+int64_t dlkf_samples_closed(dlkf_samples *s, int ended, double *imu, double seconds[3]) {
   if (isnan(s->t0)) return 0;
-  const double end = dlkf_samples_boundary(s, s->epochs + 1), rounding = 4 * ulp(end);
+  const double end = dlkf_samples_boundary(s, s->until), rounding = 4 * ulp(end);
   const double last = ended ? dlkf_samples_latest(s) : dlkf_samples_settled(s);
   if (!(last >= end - (ended && slack(s) > rounding ? slack(s) : rounding))) return 0;
-  resampled(s, dlkf_samples_boundary(s, s->epochs), EPOCH_S, DLKF_SAMPLES, imu);
-  s->epochs++;
+  const int64_t count = s->until - s->epochs;
+  const double begin = dlkf_samples_boundary(s, s->epochs);
+  resampled(s, begin, (double)count * EPOCH_S, DLKF_SAMPLES, imu);
+  seconds[0] = s->gap[0] - begin;
+  seconds[1] = s->gap[1] - s->gap[0];
+  seconds[2] = end - s->gap[1];
+  s->gap[0] = s->gap[1] = NAN;
+  s->missing = 0;
+  s->epochs = s->until++;
   while (s->count > BEFORE && at(s, BEFORE)->t <= dlkf_samples_boundary(s, s->epochs)) drop(s);
-  return 1;
+  return count;
 }
 
 /* DLKF_SAMPLES samples from the open update interval's beginning to the last that can be no spike, and the seconds that they span. */
