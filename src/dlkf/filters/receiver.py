@@ -4,7 +4,7 @@ With a delay d of the fixes and an antenna at l̂ = l + δl from the IMU, a fix 
 and velocity of the antenna at t − d (:func:`dlkf.navigation.error_model.antenna`): between two samples of the window,
 and beyond its ends with the acceleration a there. H has −v_a and −a for δd (zero below ``MOVING``, where v_a is mostly
 the filter's own error, which is in the innovation too), C and C [ω×] for δl, with v_a the velocity of the antenna, and
-λ + d for the age of the fix before the window's end. a is the change of velocity over ``SLOPE_S`` to either side, inside
+λ + d for the age of the fix. a is the change of velocity over ``SLOPE_S`` to either side, inside
 the window: a mean over all of it lags in turns, and the delay seems too certain. A
 receiver's clock that is fast by r against that of the IMU makes the delay grow, ḋ = r (:func:`let_delay_grow`). A
 filter with the source ``+receiver`` (:class:`dlkf.filters.aids.receiver.Receiver`) estimates d, δl and r.
