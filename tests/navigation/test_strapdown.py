@@ -141,10 +141,16 @@ def test_state_between_samples():
     frame, imu, state = frame_at(), lively_imu(1, M), start(1)
     window = strapdown(state, imu, DT, frame)
     lag = torch.tensor([10.5 * DT], dtype=torch.float64)
-    between = window.interpolate_before(lag, DT)
+    between = window.interpolate_before(state, lag, DT)
     assert torch.allclose(between.p_n, (window.p_n[:, -11] + window.p_n[:, -12]) / 2)
-    at_end = window.interpolate_before(torch.zeros(1, dtype=torch.float64), DT)
+    at_end = window.interpolate_before(state, torch.zeros(1, dtype=torch.float64), DT)
     assert torch.allclose(at_end.C_nb, window.end.C_nb, atol=1e-9)
+    lag = torch.tensor([(M - 0.25) * DT], dtype=torch.float64)  # in the first sample
+    first = window.interpolate_before(state, lag, DT)
+    assert torch.allclose(first.p_n, 0.75 * state.p_n + 0.25 * window.p_n[:, 0])
+    assert torch.allclose(window.velocity_before(state, lag, DT), first.v_n)
+    at_start = window.interpolate_before(state, torch.tensor([M * DT], dtype=torch.float64), DT)
+    assert torch.allclose(at_start.C_nb, state.C_nb, atol=1e-9) and torch.allclose(at_start.p_n, state.p_n)
 
 
 def test_python_ins_agrees_on_a_minute_of_driving():

@@ -167,7 +167,7 @@ def advance(
     window = strapdown(state, corrected, dt, frame)
     prior = window.end
     tail = max(1, min(imu.shape[1], round(RATE_AVERAGE_S / dt)))
-    at_fix = prior if fix.lag is None else window.interpolate_before(fix.lag, dt)
+    at_fix = prior if fix.lag is None else window.interpolate_before(state, fix.lag, dt)
     rate_b = corrected[:, -tail:, 3:].sum(1) / tail
     few = max(1, min(tail, round(ARM_RATE_S / dt)))
     if fix.lag is None:

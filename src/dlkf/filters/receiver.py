@@ -2,9 +2,10 @@
 
 With a delay d of the fixes and an antenna at l̂ = l + δl from the IMU, a fix that is stamped t is predicted as position
 and velocity of the antenna at t − d (:func:`dlkf.navigation.error_model.antenna`): between two samples of the window,
-and beyond its ends with its mean acceleration a. H has −v_a and −a for δd (zero below ``MOVING``, where v_a is mostly
+and beyond its ends with the acceleration a there. H has −v_a and −a for δd (zero below ``MOVING``, where v_a is mostly
 the filter's own error, which is in the innovation too), C and C [ω×] for δl, with v_a the velocity of the antenna, and
-−(λ + d) I for the velocity in a position that lies λ before the window's end by its stamp. A
+λ + d for the age of the fix. a is the change of velocity over ``SLOPE_S`` to either side, inside
+the window: a mean over all of it lags in turns, and the delay seems too certain. A
 receiver's clock that is fast by r against that of the IMU makes the delay grow, ḋ = r (:func:`let_delay_grow`). A
 filter with the source ``+receiver`` (:class:`dlkf.filters.aids.receiver.Receiver`) estimates d, δl and r.
 """
@@ -27,6 +28,7 @@ ARM = ("lever_forward_m", "lever_right_m", "lever_down_m")
 DRIFT = "clock_drift_ppm"
 PPM = 1e-6
 MOVING = 1.0  # m/s: a slower car shows no delay
+SLOPE_S = 0.2  # s to either side of a fix, over which the acceleration is a mean
 
 
 def has_receiver(states: ErrorStates) -> bool:
@@ -35,11 +37,12 @@ def has_receiver(states: ErrorStates) -> bool:
 
 
 def widen_start(P: Float[Tensor, "B n n"], start: NavState, states: ErrorStates) -> Float[Tensor, "B n n"]:
-    """P of a start whose position is that of a fix: as uncertain as its age and its antenna, σ_d² v vᵀ + C Σ_l Cᵀ."""
-    P, k, d = P.clone(), states.of(ARM[0]).start, states.of(DELAY).start
-    v, C = start.v_n.unsqueeze(-1), start.C_nb
-    P[:, POSITION, POSITION] += P[:, d : d + 1, d : d + 1] * (v @ v.mT) + C @ P[:, k : k + 3, k : k + 3] @ C.mT
-    return P
+    """P of a start whose position is that of a fix: its error is δp + v δd − C δl with those of age and antenna."""
+    k = states.of(ARM[0]).start
+    F = torch.eye(P.shape[-1], dtype=P.dtype, device=P.device).repeat(len(P), 1, 1)
+    F[:, POSITION, states.of(DELAY).start] = start.v_n
+    F[:, POSITION, k : k + 3] = -start.C_nb
+    return F @ P @ F.mT
 
 
 def let_delay_grow(
@@ -69,12 +72,12 @@ def predict_fix(epoch: Epoch, parameters: Mapping[str, Tensor]) -> Epoch:
     lag, M, dt = parameters[DELAY], epoch.imu.shape[1], epoch.dt
     if epoch.fix.lag is not None:
         lag = lag + epoch.fix.lag
-    within = lag.clamp(0.0, (M - 1) * dt)
-    at_fix = epoch.window.interpolate_before(within, dt)
+    within = lag.clamp(0.0, M * dt)
+    at_fix = epoch.window.interpolate_before(epoch.start, within, dt)
     few = max(1, min(M, round(ARM_RATE_S / dt)))
     rate, beyond = rate_before(epoch.corrected[..., 3:], within / dt, few), (lag - within).unsqueeze(-1)
     p, v = antenna(at_fix, rate, arm, epoch.frame).split(3, -1)
-    a = _acceleration(epoch)
+    a = _acceleration(epoch, lag)
     predicted = torch.cat((p - beyond * v + 0.5 * beyond.square() * a, v - beyond * a), -1)
     z, fix = (epoch.fix.value - predicted) * epoch.used, epoch.fix._replace(lag=lag)
     return epoch._replace(at_fix=at_fix, rate_at_fix_b=rate, lever_arm_b=arm, z=z, fix=fix)
@@ -84,11 +87,17 @@ def add_columns(H: Float[Tensor, "B 6 n"], epoch: Epoch, states: ErrorStates) ->
     """H with the columns of delay and antenna, for an epoch of :func:`predict_fix`."""
     H, C, k = H.clone(), epoch.at_fix.C_nb, states.of(ARM[0]).start
     v = antenna(epoch.at_fix, epoch.rate_at_fix_b, epoch.lever_arm_b, epoch.frame)[:, 3:]
-    moves = v.norm(dim=-1, keepdim=True) > MOVING
-    H[:, :, states.of(DELAY).start] = torch.where(moves, -torch.cat((v, _acceleration(epoch)), -1), 0.0)
+    moves, a = v.norm(dim=-1, keepdim=True) > MOVING, _acceleration(epoch, epoch.fix.lag)
+    H[:, :, states.of(DELAY).start] = torch.where(moves, -torch.cat((v, a), -1), 0.0)
     H[:, :, k : k + 3] = torch.cat((C, C @ skew(epoch.rate_at_fix_b)), 1)
     return H
 
 
-def _acceleration(epoch: Epoch) -> Float[Tensor, "B 3"]:
-    return (epoch.window.end.v_n - epoch.start.v_n) / (epoch.dt * epoch.imu.shape[1])
+def _acceleration(epoch: Epoch, lag: Float[Tensor, " B"]) -> Float[Tensor, "B 3"]:
+    """Mean over ``SLOPE_S`` to either side of ``lag`` seconds before the window's end, inside the window [m/s²]."""
+    span, dt = epoch.imu.shape[1] * epoch.dt, epoch.dt
+    least = min(SLOPE_S, 0.5 * span)
+    middle = lag.clamp(0.0, span)
+    late, early = (middle - least).clamp_min(0.0), (middle + least).clamp_max(span)
+    gained = epoch.window.velocity_before(epoch.start, late, dt) - epoch.window.velocity_before(epoch.start, early, dt)
+    return gained / (early - late).unsqueeze(-1)

@@ -40,9 +40,11 @@ from dlkf.filters.adaptive import AdaptiveNoise
 from dlkf.filters.gating import CoarseMemory, FixGate, GateMemory
 from dlkf.filters.integration import Epoch
 from dlkf.filters.receiver import add_columns, has_receiver
+from dlkf.filters.slow_errors import add_slow_columns, has_slow_errors
 from dlkf.filters.tuning import Tuning
+from dlkf.navigation.attitude import skew
 from dlkf.navigation.error_model import mask_rows, measurement_matrix
-from dlkf.navigation.state import VELOCITY, ErrorStates
+from dlkf.navigation.state import ATTITUDE, GYRO, VELOCITY, ErrorStates
 
 
 class Measurement(NamedTuple):
@@ -137,6 +139,27 @@ def describe_row(
     return torch.cat((said, rows.used[:, :1].to(said.dtype)), -1)
 
 
+def _look_back(H: Float[Tensor, "B 6 n"], epoch: Epoch, lag: Float[Tensor, " B"]) -> Float[Tensor, "B 6 n"]:
+    """H of a fix ``lag`` seconds λ before the window's end, with s the velocity gained since from specific force:
+
+    δh(t − λ) = δh + λ C ζ
+    δv(t − λ) = δv + [s×] δh + λ C ε + λ/2 [s×] C ζ
+    δp(t − λ) = δp − λ δv − λ/2 ([s×] δh + λ C ε + λ/3 [s×] C ζ).
+    """
+    H, lag = H.clone(), lag[:, None, None]
+    end = epoch.window.end
+    gained = end.v_n - epoch.at_fix.v_n - lag[:, 0] * epoch.window.gravity
+    H[..., GYRO] += lag * (H[..., ATTITUDE] @ end.C_nb)
+    tilt = skew(gained)
+    turned = 0.5 * lag * (tilt @ end.C_nb)
+    columns = torch.cat((tilt, lag * end.C_nb, turned), -1)
+    H[:, 3:6, ATTITUDE.start : GYRO.stop] += columns
+    columns = torch.cat((columns[..., :6], (2 / 3) * turned), -1)
+    H[:, :3, ATTITUDE.start : GYRO.stop] -= 0.5 * lag * columns
+    H[:, :3, VELOCITY] = -lag * torch.eye(3, dtype=H.dtype, device=H.device)
+    return H
+
+
 class FixMemory(NamedTuple):
     """What belongs to the receiver."""
 
@@ -183,8 +206,8 @@ class GnssFix:
     def matrix(self, epoch: Epoch) -> Float[Tensor, "B 6 n"]:
         """H of all components, used or not."""
         H = measurement_matrix(epoch.at_fix, epoch.rate_at_fix_b, epoch.lever_arm_b, epoch.frame, self.states.count)
-        if epoch.fix.lag is not None:  # δp at the fix = δp at the window's end − lag · δv
-            H = H.clone()
-            v = VELOCITY.start
-            H[:, 0, v] = H[:, 1, v + 1] = H[:, 2, v + 2] = -epoch.fix.lag
+        if epoch.fix.lag is not None:
+            H = _look_back(H, epoch, epoch.fix.lag)
+        if has_slow_errors(self.states):
+            H = add_slow_columns(H, self.states)
         return add_columns(H, epoch, self.states) if has_receiver(self.states) else H

@@ -41,18 +41,25 @@ class Window(NamedTuple):
     end: NavState  # (B, …), attitude orthonormalised
     gravity: Tensor  # (B, 3) m/s² that acted over the window
 
-    def interpolate_before(self, lag: Float[Tensor, " B"], dt: float) -> NavState:
-        """State ``lag`` seconds before the window's end, linear between samples (0 ≤ lag < window)."""
+    def interpolate_before(self, start: NavState, lag: Float[Tensor, " B"], dt: float) -> NavState:
+        """State ``lag`` seconds before the window's end, linear between samples (0 ≤ lag ≤ window); ``start`` is that
+        at its beginning."""
+        place = self._place(lag, dt)
+        p = _interpolate(start.p_n, self.p_n, *place)
+        v = _interpolate(start.v_n, self.v_n, *place)
+        C = _interpolate(start.C_nb.flatten(1), self.C_nb.flatten(2), *place)
+        return NavState(p, v, orthonormalise(C.unflatten(-1, (3, 3))))
+
+    def velocity_before(self, start: NavState, lag: Float[Tensor, " B"], dt: float) -> Float[Tensor, "B 3"]:
+        """The velocity of :meth:`interpolate_before`."""
+        return _interpolate(start.v_n, self.v_n, *self._place(lag, dt))
+
+    def _place(self, lag: Float[Tensor, " B"], dt: float) -> tuple[Tensor, Tensor]:
+        """Sample (B,) in which that time lies, and which part (B, 1) of it has gone by."""
         M = self.p_n.shape[1]
-        place = (M - 1 - lag / dt).clamp(0, M - 1)
-        low = place.floor().clamp(max=max(M - 2, 0)).long()
-        high = (low + 1).clamp(max=M - 1)
-        part = (place - low)[:, None]
-        row = torch.arange(len(low), device=low.device)
-        p = torch.lerp(self.p_n[row, low], self.p_n[row, high], part)
-        v = torch.lerp(self.v_n[row, low], self.v_n[row, high], part)
-        C = torch.lerp(self.C_nb[row, low], self.C_nb[row, high], part[..., None])
-        return NavState(p, v, orthonormalise(C))
+        place = (M - lag / dt).clamp(0, M)
+        sample = place.floor().clamp(max=M - 1).long()
+        return sample, (place - sample).unsqueeze(-1)
 
 
 def strapdown(start: NavState, imu: Float[Tensor, "B M 6"], dt: float, frame: TangentFrame) -> Window:
@@ -74,6 +81,15 @@ def strapdown(start: NavState, imu: Float[Tensor, "B M 6"], dt: float, frame: Ta
     else:
         (p, v, C, *end), _ = _mechanise(*start, imu, dt, gravity, frame.earth_rate_n)
     return Window(p, v, C, NavState(*end), gravity)
+
+
+def _interpolate(
+    start: Float[Tensor, "B n"], ends: Float[Tensor, "B M n"], sample: Tensor, part: Float[Tensor, "B 1"]
+) -> Float[Tensor, "B n"]:
+    """Between a sample's begin and end, of values at the window's start and at the samples' ends."""
+    row = torch.arange(len(sample), device=sample.device)
+    begin = torch.where(sample.unsqueeze(-1) > 0, ends[row, (sample - 1).clamp_min(0)], start)
+    return torch.lerp(begin, ends[row, sample], part)
 
 
 @lru_cache
