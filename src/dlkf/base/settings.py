@@ -58,6 +58,8 @@ def convert_value(hint: Any, value: Any, where: str) -> Any:
             if isinstance(value, (Mapping, option)):
                 return settings_from(option, value, where)
         elif _fits(option, value):
+            if option is int:
+                return int(value)
             return tuple(float(x) if float in get_args(option) else x for x in value) if _is_list(option) else value
     wanted = " or ".join(dict.fromkeys(_describe_type(option) for option in options))
     remedy = ""
