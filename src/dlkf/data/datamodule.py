@@ -255,7 +255,7 @@ class DriveDataModule(L.LightningDataModule):
 def name_apart(datasets: Sequence[str], loaded: Sequence[Sequence[Drive]]) -> list[dict[str, str]]:
     """For each dataset the names of its drives among all: ``<folder>/<drive>`` where another has a drive of that name.
 
-    InputError for the same drive in two datasets, or two drives that this does not tell apart.
+    InputError for the same drive in two datasets, or two drives of one name in folders of one name.
     """
     seen: dict[str, list[Drive]] = {}
     for folder, drives in zip(datasets, loaded):
