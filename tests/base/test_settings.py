@@ -32,6 +32,7 @@ class Outer:
 class Counts:
     count: int
     most: int | None = None
+    sizes: tuple[int, ...] = ()
 
 
 def test_values_of_the_right_type_become_settings():
@@ -43,8 +44,8 @@ def test_values_of_the_right_type_become_settings():
 
 @pytest.mark.parametrize("given", [2, 2.0])
 def test_a_whole_number_is_an_int(given):
-    made = settings_from(Counts, {"count": given, "most": given}, "counts")
-    assert type(made.count) is int and type(made.most) is int and made == Counts(2, 2)
+    made = settings_from(Counts, {"count": given, "most": given, "sizes": [given, 3.0]}, "counts")
+    assert made == Counts(2, 2, (2, 3)) and {type(x) for x in (made.count, made.most, *made.sizes)} == {int}
 
 
 @pytest.mark.parametrize(
