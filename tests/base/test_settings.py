@@ -28,11 +28,24 @@ class Outer:
     inner: Inner = field(default_factory=Inner)
 
 
+@dataclass(frozen=True)
+class Counts:
+    count: int
+    most: int | None = None
+    sizes: tuple[int, ...] = ()
+
+
 def test_values_of_the_right_type_become_settings():
     given = {"name": "x", "when_s": [1, 2], "every_s": None, "mode": "b", "inner": {"width_m": 3}}
     assert settings_from(Outer, given, "outer") == Outer("x", when_s=(1.0, 2.0), mode="b", inner=Inner(3))
     ready = Outer("y")
     assert settings_from(Outer, ready, "outer") is ready
+
+
+@pytest.mark.parametrize("given", [2, 2.0])
+def test_a_whole_number_is_an_int(given):
+    made = settings_from(Counts, {"count": given, "most": given, "sizes": [given, 3.0]}, "counts")
+    assert made == Counts(2, 2, (2, 3)) and {type(x) for x in (made.count, made.most, *made.sizes)} == {int}
 
 
 @pytest.mark.parametrize(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 
 import lightning as L
+import pandas as pd
 import pytest
 import torch
 from lightning.pytorch.callbacks import ModelCheckpoint
@@ -13,7 +14,11 @@ from dlkf.base.classes import instantiate
 from dlkf.base.errors import InputError
 from dlkf.command.composing import compose_command
 from dlkf.data.datamodule import DriveDataModule
+from dlkf.data.kinds import drive_imus, drive_kinds
 from dlkf.data.masks import BiasLaw, Outage, mask_outage, withhold_fixes
+from dlkf.evaluation.protocol import Scenes
+from dlkf.evaluation.study import run_scenes
+from dlkf.filters.model_based import Ins
 from tests.cars import REAL, write_cars
 
 
@@ -50,6 +55,28 @@ def test_a_drive_that_is_given_twice_is_refused(town, tmp_path):
     for twice in (town, copy):
         with pytest.raises(InputError, match=rf"data.datasets: {twice} has drives of another of them: car-0, car-1"):
             _module(town, twice).setup()
+
+
+def test_drives_of_one_name_in_two_datasets_keep_their_kind_and_imu(tmp_path):
+    """As of real drives and the semi-real ones made of them; a name that is in one dataset alone stays as it is."""
+    places = {}
+    for folder, count, kind in (("real", 6, "real"), ("semi", 5, "semi-real")):
+        places[folder] = write_cars(tmp_path / folder, count, seconds=20 + len(places))
+        table = pd.read_parquet(places[folder] / "drives.parquet").assign(kind=kind, imu=f"imu of {folder}")
+        table.to_parquet(places[folder] / "drives.parquet")
+    data = _module(*places.values(), split={"test": "all"})
+    kinds, imus = data.describe_drives(drive_kinds), data.describe_drives(drive_imus)
+    assert {d.name for d in data.stack} == set(kinds) == set(imus) and len(kinds) == 11 and kinds["car-5"] == "real"
+    for drive in data.stack:
+        assert kinds[drive.name] == {"real": "real", "semi": "semi-real"}[drive.dataset]
+        assert imus[drive.name] == f"imu of {drive.dataset}"
+    scores = run_scenes({"ins": Ins()}, Scenes.of_split(data, "test", None, 0), kinds=kinds)
+    assert {(p.drive.split("/")[0], p.kind) for p in scores.segments} == {
+        ("real", "real"), ("semi", "semi-real"), ("car-5", "real"),
+    }  # fmt: skip
+    same = shutil.copytree(places["semi"], tmp_path / "more" / "real")
+    with pytest.raises(InputError, match=r"real has the folder name and drives of another of them: car-0, .*rename a"):
+        _module(places["real"], same).setup()
 
 
 def test_named_groups_and_their_mistakes(town):

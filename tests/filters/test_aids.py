@@ -10,6 +10,7 @@ import torch
 
 from dlkf.data.aid_tables import STANDARD, AidTable
 from dlkf.data.aids import ROW, aid_rows, pressure_height
+from dlkf.data.augmentation import turn_frames
 from dlkf.data.resampling import SampleGrid
 from dlkf.data.segments import whole_drives
 from dlkf.data.store import load_dataset
@@ -135,6 +136,25 @@ def test_all_three_agree_with_the_car(aided):
         seen = said[f"{name}_innovation"].isfinite()
         assert said[f"{name}_used"][seen][3:].all() and seen.sum() > 170
     assert abs(said["baro_offset_m"][-1] - 30) < 0.5 and abs(said["heading_offset"][-1]) < 0.005
+
+
+def test_a_heading_turns_with_the_frame(aided):
+    """The same innovations in frames turned by other angles, the convergence of the meridians with them."""
+    model = with_aids(build_filter("mbkf15_nhc", IMU), [STANDARD["heading"]])
+    here = torch.arange(aided.size[1])[:, None] != 20  # an interval without a heading
+    aided = replace(aided, aids={name: rows * here for name, rows in aided.aids.items()})
+    plain = integrate(aided, model).aids[0]
+    some = plain[:, 2] > 0
+    convergence = aided.truth.p_n[0, :, 1] * torch.tan(torch.asin(-aided.frame.axis_n[0, 2])) / aided.frame.radius[0]
+    assert some.sum() > 170 and convergence.abs().max() > 1e-5
+    for seed in range(3):
+        turned = turn_frames(aided, torch.Generator().manual_seed(seed))
+        assert not turned.aids["heading"][0, 20].any()
+        assert torch.equal(turned.aids["heading"][..., 1:], aided.aids["heading"][..., 1:])
+        assert torch.equal(turned.aids["speed"], aided.aids["speed"])
+        said = integrate(turned, model).aids[0]
+        assert torch.equal(said[:, 2], plain[:, 2])
+        assert torch.allclose(said[some, 0], plain[some, 0], atol=1e-8)  # rad; rounding of 180 updates
 
 
 def test_a_filter_with_sensors_that_say_nothing_is_the_filter_without(cars):

@@ -27,7 +27,7 @@ class Watched:
 
     def begin(self, batch):
         memory, error = self.kalman.begin(batch)
-        return (memory, PositionErrors.begin(batch.imu, batch.size[0], batch.epoch_s)), error
+        return (memory, PositionErrors.begin(batch.imu, batch.size[0])), error
 
     def step(self, memory, epoch):
         kalman, errors = memory

@@ -77,6 +77,16 @@ def test_network_with_and_without_gradients(dtype):
 
 
 def test_network_can_be_copied_in_the_middle_of_a_batch():
-    network = NetworkConfig(samples=50, lstm_hidden=8, lstm_layers=1, dense=(8,)).build()
-    network(torch.randn(2, 15, 50), torch.randn(2, 30), network.start(2, torch.zeros(1)))
-    copy.deepcopy(network)
+    """The copy goes on as the original does, with weights of its own."""
+    network = NetworkConfig(samples=50, lstm_hidden=8, lstm_layers=1, dense=(8,), dropout=0.0).build()
+    inputs = torch.randn(2, 15, 50), torch.randn(2, 30)
+    _, memory = network(*inputs, network.start(2, torch.zeros(1)))
+    copied = copy.deepcopy(network)
+    memory = tuple(x.detach() for x in memory)
+    outputs = [one(*inputs, memory)[0] for one in (network, copied)]
+    assert close(*outputs)
+    outputs[1].square().sum().backward()
+    assert all(p.grad is None for p in network.parameters())
+    outputs[0].square().sum().backward()
+    for one, other in zip(network.parameters(), copied.parameters(), strict=True):
+        assert close(one.grad, other.grad) and one.data_ptr() != other.data_ptr()

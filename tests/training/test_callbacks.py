@@ -1,12 +1,15 @@
 """Training strategy without a Trainer: curriculum, weights, decimation, outages, guard; all resume from state."""
 
+import copy
 import math
 from dataclasses import replace
 from itertools import pairwise
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
+import torch.optim.lr_scheduler as schedules
 
 from dlkf.base.errors import InputError
 from dlkf.training.callbacks.curriculum import LengthCurriculum
@@ -113,13 +116,14 @@ def test_random_masks_depend_on_the_step_alone():
     assert torch.equal(a, b) and not torch.equal(a, c)
 
 
-def stepped(guard: StepGuard, parameter: torch.nn.Parameter, gradient: float) -> None:
+def stepped(guard: StepGuard, parameter: torch.nn.Parameter, gradient: float, optimizer=None, schedule=None) -> None:
     """One optimiser step through the guard."""
     module = torch.nn.Module()
     module.weight, module.log = parameter, lambda *a, **k: None
-    optimizer = torch.optim.SGD([parameter], lr=1.0)
+    optimizer = optimizer or torch.optim.SGD([parameter], lr=1.0)
     parameter.grad = torch.full((2,), gradient)
-    guard.on_before_optimizer_step(None, module, optimizer)
+    configs = [] if schedule is None else [SimpleNamespace(scheduler=schedule)]
+    guard.on_before_optimizer_step(SimpleNamespace(lr_scheduler_configs=configs), module, optimizer)
     optimizer.step()
 
 
@@ -136,7 +140,7 @@ def test_guard_takes_large_steps_and_skips_those_that_are_not_finite():
     assert guard.in_a_row == 0 and not torch.equal(parameter.detach(), before)
 
 
-def test_guard_goes_back_to_the_last_good_epoch_at_a_slower_rate_and_gives_up_at_last():
+def test_guard_goes_back_to_the_last_good_epoch_and_gives_up_at_last():
     guard, parameter = StepGuard(patience=2, slower=0.5, returns=2), torch.nn.Parameter(torch.ones(2))
     module = torch.nn.Module()
     module.weight = parameter
@@ -144,10 +148,10 @@ def test_guard_goes_back_to_the_last_good_epoch_at_a_slower_rate_and_gives_up_at
     stepped(guard, parameter, 3.0)
     for _ in range(2):
         stepped(guard, parameter, math.nan)
-    assert torch.equal(parameter.detach(), torch.ones(2)) and guard.rate_factor() == 0.5
+    assert torch.equal(parameter.detach(), torch.ones(2))
     again = StepGuard(patience=2, slower=0.5, returns=2)
     again.load_state_dict(guard.state_dict())
-    assert (again.skipped, again.returned, again.rate_factor()) == (2, 1, 0.5)
+    assert (again.skipped, again.returned) == (2, 1)
     with pytest.raises(InputError, match="non-finite"):
         for _ in range(4):
             stepped(guard, parameter, math.nan)
@@ -155,6 +159,56 @@ def test_guard_goes_back_to_the_last_good_epoch_at_a_slower_rate_and_gives_up_at
     with pytest.raises(InputError, match="first epoch"):
         for _ in range(2):
             stepped(fresh, parameter, math.nan)
+
+
+def warm_up(optimizer):
+    parts = [schedules.LinearLR(optimizer, 0.1, total_iters=3), schedules.CosineAnnealingLR(optimizer, 12)]
+    return schedules.SequentialLR(optimizer, parts, [3])
+
+
+@pytest.mark.parametrize(
+    "plan",
+    [
+        lambda o: schedules.ExponentialLR(o, 0.9),
+        lambda o: schedules.StepLR(o, 4),
+        lambda o: schedules.LambdaLR(o, lambda epoch: 1 / (1 + epoch)),
+        lambda o: schedules.CosineAnnealingLR(o, 12, eta_min=0.1),
+        lambda o: schedules.CosineAnnealingWarmRestarts(o, 5, eta_min=0.1),
+        lambda o: schedules.OneCycleLR(o, 1.0, total_steps=20, cycle_momentum=False),
+        warm_up,
+    ],
+)
+@pytest.mark.filterwarnings("ignore:The epoch parameter in `scheduler.step")
+def test_a_return_of_the_guard_scales_all_further_rates_once(plan):
+    """After two returns the rates are a quarter of the schedule's in every epoch, also through a checkpoint."""
+
+    def make():
+        parameter = torch.nn.Parameter(torch.ones(2))
+        optimizer = torch.optim.SGD([{"params": [parameter], "lr": 1.0}])
+        return parameter, optimizer, plan(optimizer)
+
+    def rates(returns, resumed):
+        guard, (parameter, optimizer, schedule) = StepGuard(patience=1, slower=0.5, returns=9), make()
+        module = torch.nn.Module()
+        module.weight, out = parameter, []
+        for epoch in range(12):
+            if epoch == resumed:
+                states = optimizer.state_dict(), schedule.state_dict(), guard.state_dict()
+                guard, (parameter, optimizer, schedule) = StepGuard(patience=1, slower=0.5), make()
+                for part, state in zip((optimizer, schedule, guard), copy.deepcopy(states)):
+                    part.load_state_dict(state)
+                module.weight = parameter
+                guard.on_train_start(SimpleNamespace(current_epoch=epoch), module)
+            out.append(optimizer.param_groups[0]["lr"])
+            stepped(guard, parameter, math.nan if epoch in returns else 0.0, optimizer, schedule)
+            guard.on_train_epoch_end(None, module)
+            schedule.step()
+        return np.array(out)
+
+    plain = rates((), None)
+    expected = plain * np.repeat([1.0, 0.5, 0.25], [3, 3, 6])
+    for resumed in (None, 4, 5, 9):
+        assert np.allclose(rates((2, 5), resumed), expected, rtol=1e-12)
 
 
 @pytest.mark.parametrize("losses", [(4.0, 1.0, 2.0, 100.0, math.nan), (-1.0, -2.0, -1.5, 100.0, math.nan)])

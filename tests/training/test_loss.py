@@ -72,7 +72,7 @@ def test_likelihood_is_that_of_students_t():
     e = torch.tensor([-3.0, 2.0], dtype=torch.float64)
     expected = 0.5 * P.logdet() + 5 * torch.log1p(e @ torch.linalg.solve(P, e) / 8)
     # the floor of 1e-4 m² under the variances shifts it by some 1e-5
-    assert float(likelihood_term(solution, batch)) == pytest.approx(float(expected), abs=1e-4)
+    assert float(likelihood_term(solution, batch, batch.truth_valid)) == pytest.approx(float(expected), abs=1e-4)
 
 
 def test_unknown_truth_does_not_count_and_gives_no_nan():
@@ -100,6 +100,23 @@ def test_prior_and_posterior_shares():
     prior_only = pva_losses(mixed, batch, LossConfig(posterior=0.0))["position"]
     assert abs(float(half) * 2 - float(prior_only)) < 1e-9
     assert float(pva_losses(mixed, batch, LossConfig(prior=0.0))["position"]) < 1e-12
+
+
+@pytest.mark.parametrize("metres", [1e5, torch.inf, torch.nan])
+def test_a_segment_that_diverged_counts_in_no_term(metres):
+    """Every term is that of the other segments alone; the outage too, whose logarithm would still be 23 of 1e5 m."""
+    batch, config = scene(3, 8), LossConfig(outage=1.0, likelihood=0.1)
+    batch = replace(batch, available=batch.available & (torch.arange(8) < 5))
+    solution = integrate(batch, build_filter("mbkf15", IMU), keep_covariances=True)
+    p = solution.posterior.p_n.clone()
+    p[1, 6:] += metres
+    spoilt = replace(solution, posterior=solution.posterior._replace(p_n=p))
+    others = batch.select(torch.tensor([0, 2]))
+    expected = pva_losses(integrate(others, build_filter("mbkf15", IMU), keep_covariances=True), others, config)
+    losses = pva_losses(spoilt, batch, config)
+    assert set(losses) == {"outage", "likelihood", "position", "velocity", "attitude"}
+    for term, loss in losses.items():
+        assert float(loss) == pytest.approx(float(expected[term]), rel=1e-12), term
 
 
 class Late:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import math
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 import yaml
@@ -18,6 +20,7 @@ from dlkf.evaluation.metrics import PVA
 from dlkf.evaluation.outages import OutagePlan
 from dlkf.filters.build import build_filter
 from dlkf.filters.integration import integrate
+from dlkf.filters.model_based import bias_sigma
 from dlkf.filters.tuning import Prior, Tuning
 from dlkf.onboard.library import find_compiler
 from dlkf.tuning.baselines import tune_baselines
@@ -152,6 +155,18 @@ def test_many_segments_together_show_the_sensor_matrices_of_their_unit(cars):
         mean, std = (x[of[place]] for x in (prior.mean, prior.std))
         assert std < 0.004 and abs(mean - float(M[place[0]][place[1]])) < 4 * std
     assert prior.std[of[1, (2, 0)]] > 0.015  # a car that does not roll shows nothing of this one
+
+
+@pytest.mark.parametrize("name", ["mbkf15", "mbkf33"])
+def test_a_prior_of_one_segment_is_as_wide_as_the_turn_on_bias(cars, name):
+    """One estimate has no scatter; NaN instead would make every filter with it diverge."""
+    batch, expected, _ = one_unit(cars)
+    one = batch.select(torch.tensor([0]))
+    prior = mean_imu_error(expected, Tuning(), [one], name)
+    assert np.isfinite(prior.mean).all() and np.isfinite(prior.std).all()
+    assert np.allclose(prior.std[:6], bias_sigma(expected, build_filter(name, expected).states), rtol=1e-6)
+    best, _ = best_prior(expected, [Tuning()], [hidden(one)], f"{name}_prior")
+    assert math.isfinite(evaluate_objective(build_filter(f"{name}_prior", expected, prior=best), [hidden(one)]))
 
 
 def test_a_filter_that_is_told_its_unit_drifts_less(cars):

@@ -58,7 +58,9 @@ def convert_value(hint: Any, value: Any, where: str) -> Any:
             if isinstance(value, (Mapping, option)):
                 return settings_from(option, value, where)
         elif _fits(option, value):
-            return tuple(float(x) if float in get_args(option) else x for x in value) if _is_list(option) else value
+            if _is_list(option):
+                return tuple(map(_kind_of_list(option), value))
+            return int(value) if option is int else value
     wanted = " or ".join(dict.fromkeys(_describe_type(option) for option in options))
     remedy = ""
     if str in options and is_number(value):
@@ -80,13 +82,16 @@ def _fits(option: Any, value: Any) -> bool:
     if get_origin(option) is Literal:
         return value in get_args(option)
     if _is_list(option):
-        kind = next(x for x in get_args(option) if x is not ...)
-        return isinstance(value, (list, tuple)) and all(_fits(kind, x) for x in value)
+        return isinstance(value, (list, tuple)) and all(_fits(_kind_of_list(option), x) for x in value)
     return isinstance(value, Mapping) if get_origin(option) is Mapping else True
 
 
 def _is_list(option: Any) -> bool:
     return get_origin(option) in (tuple, list, Sequence) and set(get_args(option)) <= {float, int, str, ...}
+
+
+def _kind_of_list(option: Any) -> Any:
+    return next(x for x in get_args(option) if x is not ...)
 
 
 def _describe_type(option: Any) -> str:

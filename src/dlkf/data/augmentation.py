@@ -16,9 +16,9 @@ from dlkf.navigation.state import NavState
 def turn_frames(batch: Batch, generator: torch.Generator | None = None) -> Batch:
     """Express each segment in a tangent frame turned about down by a random angle ψ: u ← Rz(ψ) u.
 
-    Truth, GNSS and start turn together, and so do the frame's own axes and the Earth's rotation in them, so
-    that the segment stays physically exact; its n is then no longer North-East. The stds take the diagonal of
-    the turned covariance.
+    Truth, GNSS, a measured heading and start turn together, and so do the frame's own axes and the Earth's rotation in
+    them, so that the segment stays physically exact; its n is then no longer North-East, and a heading is the angle
+    from its first axis. The stds take the diagonal of the turned covariance.
     """
     B = batch.size[0]
     psi = 2 * math.pi * torch.rand(B, generator=generator, dtype=torch.float64)
@@ -49,9 +49,15 @@ def turn_frames(batch: Batch, generator: torch.Generator | None = None) -> Batch
     # turned, a horizontal component is known only where both are
     horizontal = [v[..., :2].all(-1, keepdim=True).expand_as(v[..., :2]) for v in batch.gnss_valid.split(3, -1)]
     valid = torch.cat((horizontal[0], batch.gnss_valid[..., 2:3], horizontal[1], batch.gnss_valid[..., 5:]), -1)
+    aids = dict(batch.aids)
+    if (said := aids.get("heading")) is not None:
+        measured = said[..., -1] > 0
+        heading = torch.where(measured, said[..., 0] + psi.to(said)[:, None], said[..., 0])
+        aids["heading"] = torch.cat((heading.unsqueeze(-1), said[..., 1:]), -1)
     return replace(
         batch,
         frame=frame,
+        aids=aids,
         gnss=torch.where(valid, turn_both(batch.gnss), torch.zeros_like(batch.gnss)),
         gnss_std=turn_stds(batch.gnss_std),
         gnss_valid=valid,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -46,7 +47,8 @@ class DriveDataModule(L.LightningDataModule):
     they are the same for every ``seed`` and ``batch_size``; ``eval_outage`` withholds GNSS
     there. Lengths that change need ``Trainer(reload_dataloaders_every_n_epochs=1)``.
 
-    Groups of the same name in several datasets count as one recording. ``split`` and ``fractions`` as in
+    Groups of the same name in several datasets count as one recording; drives of the same name are called
+    ``<folder>/<drive>`` here. ``split`` and ``fractions`` as in
     :func:`dlkf.data.splits.split_rows`; ``turn_frames`` and
     ``injected_bias`` (``accel_mps2``, ``gyro_dps``: 1σ) augment training.
     """
@@ -96,17 +98,11 @@ class DriveDataModule(L.LightningDataModule):
         """Load, stack and split the drives; does nothing when that is done."""
         if hasattr(self, "stack"):
             return
-        drives: list[Drive] = []
-        for folder in self.datasets:
-            more = load_dataset(
-                folder, rate_hz=self.rate_hz, epoch_s=self.epoch_s, dtype=self.dtype, progress=self.progress
-            )
-            before = {d.name: d.imu for d in drives}
-            if twice := [d.name for d in more if d.name in before and torch.equal(d.imu, before[d.name])]:
-                raise InputError(
-                    f"data.datasets: {folder} has drives of another of them: {list_some(twice, 4)}; give one"
-                )
-            drives += more
+        grid = {"rate_hz": self.rate_hz, "epoch_s": self.epoch_s, "dtype": self.dtype, "progress": self.progress}
+        loaded = [load_dataset(folder, **grid) for folder in self.datasets]
+        self._names = name_apart(self.datasets, loaded)
+        named = zip(loaded, self._names)
+        drives = [replace(drive, name=names[drive.name]) for more, names in named for drive in more]
         if not any(bool(d.ref_valid.any()) for d in drives):
             raise InputError(
                 f"no drive of {', '.join(self.datasets)} has a reference, and training needs one: position, velocity "
@@ -116,6 +112,12 @@ class DriveDataModule(L.LightningDataModule):
             drives = [self.gnss_noise.add_noise(d, self.eval_seed) for d in drives]
         self.stack = DriveStack(drives)
         self.spans = split_rows(self.stack, self.split, self.fractions, self.split_seed, self.eval_length_s)
+
+    def describe_drives(self, read: Callable[[str], Mapping[str, str]]) -> dict[str, str]:
+        """What ``read`` gives of each dataset by the names of its drives, of all by the names that they have here."""
+        self.setup()
+        pairs = zip(self.datasets, self._names)
+        return {names[drive]: value for folder, names in pairs for drive, value in read(folder).items()}
 
     def drives(self, side: str) -> list[Drive]:
         """The drives that have something on a side (``train``, ``val``, ``test``)."""
@@ -227,7 +229,7 @@ class DriveDataModule(L.LightningDataModule):
         """A line per side on its drives that give no segment on any; training segments grow to ``longest_s``."""
         fixed = ("data.eval_length_s", self.eval_length_s)
         lengths = dict.fromkeys(SIDES, fixed) | {"train": ("data.length_s", longest_s)}
-        sides = {side: [d.name for d in self.drives(side)] for side in SIDES}  # of several datasets names may repeat
+        sides = {side: [d.name for d in self.drives(side)] for side in SIDES}
         cut = [cut_segments(self.stack, length, span=self.spans[side]) for side, (_, length) in lengths.items()]
         idle = find_unused_drives(self.stack, [segment for segments in cut for segment in segments])
         out = []
@@ -248,6 +250,27 @@ class DriveDataModule(L.LightningDataModule):
     def share(self) -> tuple[int, int]:
         """Number of this process, and how many there are."""
         return (0, 1) if self.trainer is None else (self.trainer.global_rank, self.trainer.world_size)
+
+
+def name_apart(datasets: Sequence[str], loaded: Sequence[Sequence[Drive]]) -> list[dict[str, str]]:
+    """For each dataset the names of its drives among all: ``<folder>/<drive>`` where another has a drive of that name.
+
+    InputError for the same drive in two datasets, or two drives of one name in folders of one name.
+    """
+    seen: dict[str, list[Drive]] = {}
+    for folder, drives in zip(datasets, loaded):
+        if twice := [d.name for d in drives if any(torch.equal(d.imu, other.imu) for other in seen.get(d.name, ()))]:
+            raise InputError(f"data.datasets: {folder} has drives of another of them: {list_some(twice, 4)}; give one")
+        if alike := [d.name for d in drives if any(d.dataset == other.dataset for other in seen.get(d.name, ()))]:
+            raise InputError(
+                f"data.datasets: {folder} has the folder name and drives of another of them: {list_some(alike, 4)}; "
+                "rename a folder"
+            )
+        for drive in drives:
+            seen.setdefault(drive.name, []).append(drive)
+    return [
+        {d.name: d.name if len(seen[d.name]) == 1 else f"{d.dataset}/{d.name}" for d in drives} for drives in loaded
+    ]
 
 
 class TrainBatches:

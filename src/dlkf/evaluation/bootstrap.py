@@ -33,7 +33,7 @@ _CELLS = 4_000_000  # weights held at a time
 
 @dataclass(frozen=True)
 class Comparison:
-    """``a`` against ``b``: ratio and difference of a statistic over the same units, with their intervals.
+    """``a`` against ``b``: ratio of a statistic over the same units, with its interval.
 
     The bounds are NaN where ``groups``, the number of recordings (of units where none were given), is too small.
     """
@@ -44,9 +44,6 @@ class Comparison:
     ratio: float
     ratio_low: float
     ratio_high: float
-    difference: float
-    difference_low: float
-    difference_high: float
     units: int
     groups: int
     confidence: float
@@ -115,7 +112,7 @@ def compare(
     resamples: int = 2000,
     seed: int = 0,
 ) -> Comparison:
-    """Ratio a/b and difference a − b of a statistic over paired units (U,), with their intervals.
+    """Ratio a/b of a statistic over paired units (U,), with its interval.
 
     Units where either value is NaN (no truth) are left out of both. With fewer than :data:`MIN_GROUPS` recordings
     (units where no ``groups`` are given) the bounds are NaN.
@@ -127,16 +124,14 @@ def compare(
     G = int(drawn.max()) + 1 if len(a) else 0
     one = np.ones((1, len(a)))
     sa, sb = ((float(weighted_means(x, one, statistic)[0]) if len(a) else np.nan) for x in (a, b))
-    ratios, differences = [np.empty(0)], [np.empty(0)]
+    ratios = [np.empty(0)]
     with np.errstate(invalid="ignore", divide="ignore"):
         if G >= MIN_GROUPS:
             for w in draw_weights(drawn, resamples, np.random.default_rng(seed)):
-                ra, rb = weighted_means(a, w, statistic), weighted_means(b, w, statistic)
-                ratios.append(ra / rb)
-                differences.append(ra - rb)
-        ratio, difference = float(np.divide(sa, sb)), float(np.subtract(sa, sb))
-    (rl, rh), (dl, dh) = (_interval(np.concatenate(x), G) for x in (ratios, differences))
-    return Comparison(statistic, sa, sb, ratio, rl, rh, difference, dl, dh, len(a), G, CONFIDENCE)
+                ratios.append(weighted_means(a, w, statistic) / weighted_means(b, w, statistic))
+        ratio = float(np.divide(sa, sb))
+    low, high = _interval(np.concatenate(ratios), G)
+    return Comparison(statistic, sa, sb, ratio, low, high, len(a), G, CONFIDENCE)
 
 
 def _number(groups: NDArray[np.str_]) -> NDArray[np.int64]:

@@ -33,10 +33,12 @@ class LearnedConfig:
     (the paper); ``run`` runs it every epoch, with a fix flag and the time since the last fix as further
     inputs (paper.md 4.3). ``frame``: axes of features and gain. ``imu_error``: ``constant`` through an epoch, or
     ``affine`` in the samples, with sensor matrices (paper.md 4.11 E0, E4); ``imu_error_bound`` [σ] limits its bias,
-    0 does not. ``known_from``: with ``training``, features have the sizes and the IMU error starts at the mean that
-    training segments have (no truth is used); with ``nothing``, fixed sizes and zero. ``detach_features`` stops the
-    gradient at the network's inputs (paper.md 4.13). ``training_turn`` [rad] limits the attitude correction of an
-    update in training alone (paper.md 4.10); 0 does not. ``rate_hz``, ``epoch_s``: what it was trained on.
+    0 does not. ``known_from``: with ``training``, features have the sizes and the network's IMU error begins
+    its training at the mean that training segments have (no truth is used); with ``nothing``, fixed sizes and zero.
+    Until the network has run for the first time, at the end of the first epoch (``hold``: at the first fix), the IMU
+    error is zero in both. ``detach_features`` stops the gradient at the network's inputs (paper.md 4.13).
+    ``training_turn`` [rad] limits the attitude correction of an update in training alone (paper.md 4.10); 0 does not.
+    ``rate_hz``, ``epoch_s``: what it was trained on.
     """
 
     network: NetworkConfig | OwnNetwork = field(default_factory=NetworkConfig)

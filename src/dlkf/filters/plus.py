@@ -184,7 +184,7 @@ class PlusFilter(nn.Module):
         zeros, B = batch.imu.new_zeros, batch.size[0]
         zero = zeros(B)
         outage = VirtualOutage.begin(kalman.P)
-        matching, errors = Matching.begin(batch.imu, B), PositionErrors.begin(batch.imu, B, batch.epoch_s)
+        matching, errors = Matching.begin(batch.imu, B), PositionErrors.begin(batch.imu, B)
         fix_noise = FixNoise.begin(batch.imu, B, batch.start_noise)
         return PlusMemory(kalman, self.network.start(B), zero, zero, matching, zero, outage, errors, fix_noise), error
 

@@ -58,7 +58,7 @@ class PositionErrors(NamedTuple):
     slow: Tensor  # (B, 3) m², variance of the last fix that is not white
 
     @classmethod
-    def begin(cls, like: Tensor, size: int, epoch_s: float) -> PositionErrors:
+    def begin(cls, like: Tensor, size: int) -> PositionErrors:
         """Before the first fix."""
         zero, zeros = like.new_zeros(size, 2), like.new_zeros(size, 3)
         return cls(zeros, zeros, zero, zero + 1.0, zero, zero + 1.0, zero, zero + USUAL_FIXES, zeros)

@@ -121,7 +121,7 @@ class NavState(NamedTuple):
         )
 
     def error_to(self, truth: NavState) -> Float[Tensor, "*b 9"]:
-        """truth ⊖ state: the 9-vector dx with ``state.corrected(dx) == truth``."""
+        """truth ⊖ state: the 9-vector dx with ``state.correct(dx) == truth``."""
         return torch.cat(
             (truth.p_n - self.p_n, truth.v_n - self.v_n, vector_from_rotation(truth.C_nb @ self.C_nb.mT)), -1
         )

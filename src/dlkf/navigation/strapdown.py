@@ -5,7 +5,7 @@ position are prefix sums. In the tangent frame n, which is fixed to the Earth (p
 
     C' = C [w_b×] − [ω×] C,    v' = C f_b + g(p) − 2 ω × v,    p' = v,    ω = Earth rate.
 
-Rate and specific force are constant within a sample (they are its means) and integrated exactly, gravity is
+Rate and specific force are constant within a sample (they are its means) and integrated to third order, gravity is
 taken at the window's midpoint, Earth rotation and Coriolis are exact to first order in ωT: with
 S = Σ ΔV and P = Σ ΔP the velocity and position gained from specific force, integration by parts leaves
 

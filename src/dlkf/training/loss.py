@@ -15,7 +15,7 @@ from math import prod
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import smooth_l1_loss
 
@@ -78,13 +78,18 @@ Loss = Callable[[BatchSolution, Batch], Mapping[str, Tensor]]
 def pva_losses(solution: BatchSolution, batch: Batch, config: LossConfig) -> dict[str, Tensor]:
     """Mean smooth-L1 of the scaled errors of position, velocity and attitude, without weights and fixed factors.
 
-    Attitude error is log(C_ref Ĉᵀ), never a difference of angles. Epochs without truth do not count; a batch
-    without any attitude truth has an attitude loss of 0. Segments that diverged do not count either.
+    Beside them the terms of filters with a covariance. Attitude error is log(C_ref Ĉᵀ), never a difference of angles.
+    Epochs without truth do not count; a batch without any attitude truth has an attitude loss of 0. Segments that
+    diverged do not count either, in any term.
     """
+    off = (solution.posterior.p_n - torch.nan_to_num(batch.truth.p_n)).detach().abs().amax(-1)
+    sound = (torch.where(batch.truth_valid & batch.present, off, 0.0) < config.diverged_m).all(1, keepdim=True)
+    known = batch.truth_valid & batch.present & sound
     losses = {}
-    for term, of_term in (("outage", outage_term), ("likelihood", likelihood_term)):
-        if factor := getattr(config, term):
-            losses[term] = factor * of_term(solution, batch)
+    if config.outage:
+        losses["outage"] = config.outage * outage_term(solution, batch, known)
+    if config.likelihood:
+        losses["likelihood"] = config.likelihood * likelihood_term(solution, batch, known)
     total = config.prior + config.posterior
     if not total:
         return losses
@@ -96,8 +101,6 @@ def pva_losses(solution: BatchSolution, batch: Batch, config: LossConfig) -> dic
         torch.nan_to_num(batch.truth.v_n),
         torch.where(batch.attitude_valid[..., None, None], batch.truth.C_nb, eye),
     )
-    off = (solution.posterior.p_n - truth.p_n).detach().abs().amax(-1)
-    sound = (torch.where(batch.truth_valid & batch.present, off, 0.0) < config.diverged_m).all(1, keepdim=True)
     errors = [(w, state.error_to(truth)) for w, state in
               ((config.prior, solution.prior), (config.posterior, solution.posterior)) if w]  # fmt: skip
     for i, (term, scale, mask) in enumerate(zip(TERMS, scales, masks)):
@@ -112,14 +115,14 @@ def pva_losses(solution: BatchSolution, batch: Batch, config: LossConfig) -> dic
     return losses
 
 
-def outage_term(solution: BatchSolution, batch: Batch) -> Tensor:
-    """Mean over the epochs without GNSS; 0 without any."""
-    hidden = ~batch.available & batch.truth_valid & batch.present
-    return _mean(torch.log1p(_horizontal(solution, batch).square().sum(-1)), hidden)
+def outage_term(solution: BatchSolution, batch: Batch, known: Bool[Tensor, "B T"]) -> Tensor:
+    """Mean over the epochs without GNSS of those with known truth; 0 without any."""
+    return _mean(torch.log1p(_horizontal(solution, batch).square().sum(-1)), known & ~batch.available)
 
 
-def likelihood_term(solution: BatchSolution, batch: Batch) -> Tensor:
-    """Half the mean over epochs with GNSS, half that over epochs without; needs ``keep_covariances``."""
+def likelihood_term(solution: BatchSolution, batch: Batch, known: Bool[Tensor, "B T"]) -> Tensor:
+    """Half the mean over epochs with GNSS, half that over epochs without, of those with known truth; needs
+    ``keep_covariances``."""
     assert solution.covariances is not None
     e = _horizontal(solution, batch)
     P = solution.covariances.updated[..., :2, :2]
@@ -127,7 +130,6 @@ def likelihood_term(solution: BatchSolution, batch: Batch) -> Tensor:
     det = (a * b - c * c).clamp_min(SMALLEST_VARIANCE**2)
     square = (b * e[..., 0] ** 2 + a * e[..., 1] ** 2 - 2 * c * e[..., 0] * e[..., 1]) / det
     value = 0.5 * det.log() + 0.5 * (FREEDOM + 2) * torch.log1p(square / FREEDOM)
-    known = batch.truth_valid & batch.present
     return 0.5 * (_mean(value, known & batch.available) + _mean(value, known & ~batch.available))
 
 

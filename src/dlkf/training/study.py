@@ -95,9 +95,7 @@ def run_study(
         shipped = {name: trained_filter(name) for name in names if shipped_folder(name)}
         filters = {**baselines.build(), **shipped, learned: load_filter(weights)}
         scenes = Scenes.of_split(data, "test", plan, scoring.seed)
-        kinds: dict[str, str] = {}
-        for dataset in data.datasets:
-            kinds |= drive_kinds(dataset)
+        kinds = data.describe_drives(drive_kinds)
         baseline = BASELINE if BASELINE in filters else None
         groups = {d.name: d.group for d in data.stack}
         scores = run_scenes(filters, scenes, kinds=kinds, groups=groups, law=scoring.injected_bias, seed=scoring.seed)
@@ -235,9 +233,7 @@ def model_card(settings: StudySettings, data: DriveDataModule, run: str | None) 
 
     ``imus`` are those that it was trained on, of a filter that overfits to them (paper.md 4.8; not ``plus``).
     """
-    drives, called = data.drives("train"), {}
-    for dataset in data.datasets:
-        called |= drive_imus(dataset)
+    drives, called = data.drives("train"), data.describe_drives(drive_imus)
     overfitted = settings.fit.model.kind != "plus" and not settings.fit.finetune
     return {
         "trained_on": sorted({d.group for d in drives}),

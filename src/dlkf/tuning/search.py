@@ -22,7 +22,7 @@ from dlkf.data.drive import Batch
 from dlkf.evaluation.metrics import PVA, end_errors, geometric_mean, mean_error, segment_errors
 from dlkf.filters.build import build_causal
 from dlkf.filters.integration import Estimator, integrate
-from dlkf.filters.model_based import Mbkf
+from dlkf.filters.model_based import Mbkf, bias_sigma
 from dlkf.filters.tuning import Prior, Tuning
 from dlkf.navigation.imu_errors import ImuSpec
 from dlkf.navigation.state import ErrorStates
@@ -192,9 +192,10 @@ def mean_imu_error(imu: ImuSpec, tuning: Tuning, batches: Sequence[Batch], name:
 
     No truth is used. Biases: mean and spread of the estimates. The spread is what a filter that starts from the mean
     still has to find: the estimator's own scatter where all drives share one IMU, the turn-on spread where they do
-    not. Sensor matrices, which a segment of a minute or two hardly shows: all segments together as measurements of one
-    unit, Λ = Λ₀ + Σ (Pᵢ⁻¹ − Λ₀) and mean Λ⁻¹ Σ Pᵢ⁻¹ xᵢ for estimates xᵢ, Pᵢ that began at zero and Λ₀⁻¹. (A turn of
-    all axes together is not separable from attitude; it does no harm, but its spread comes out too small.)
+    not; of a single segment, which has no scatter, the turn-on spread of the preset. Sensor matrices, which a segment
+    of a minute or two hardly shows: all segments together as measurements of one unit, Λ = Λ₀ + Σ (Pᵢ⁻¹ − Λ₀) and mean
+    Λ⁻¹ Σ Pᵢ⁻¹ xᵢ for estimates xᵢ, Pᵢ that began at zero and Λ₀⁻¹. (A turn of all axes together is not separable from
+    attitude; it does no harm, but its spread comes out too small.)
     """
     estimator = build_causal(name, imu, "a prior does not", tuning=tuning)
     assert isinstance(estimator, Mbkf)
@@ -212,7 +213,8 @@ def mean_imu_error(imu: ImuSpec, tuning: Tuning, batches: Sequence[Batch], name:
         pulls.append((known @ last[-1][:, 6:, None]).sum(0))
     estimates = torch.cat(last)
     floor = torch.tensor([1e-3] * 3 + [1e-5] * (states.imu - 3), dtype=estimates.dtype)
-    mean, spread = estimates.mean(0), estimates.std(0)
+    mean, spread = estimates.mean(0), torch.zeros_like(estimates[0])
+    spread[:6] = estimates[:, :6].std(0) if len(estimates) > 1 else bias_sigma(imu, states)
     if states.elements:
         assert before is not None
         together = torch.linalg.inv(before + torch.stack(gains).sum(0))

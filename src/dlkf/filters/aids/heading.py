@@ -4,7 +4,9 @@ With f = C_nb e₁, the heading is ψ = atan2(f_E, f_N), and C = exp([δh×]) Ĉ
 
     δψ = δh_D − f_D (f_N δh_N + f_E δh_E) / (f_N² + f_E²)
 
-The tangent frame's North differs from North at the car by the convergence of the meridians, p_E tan φ / R.
+The tangent frame's North differs from North at the car by the convergence of the meridians, e tan φ / R, with e the
+way East. Both are written with the Earth's axis in n, (cos φ, 0, −sin φ) or the same turned about down
+(:func:`dlkf.data.augmentation.turn_frames`): a measured heading is the angle from the first axis of n.
 """
 
 from __future__ import annotations
@@ -56,8 +58,9 @@ class DualAntennaHeading(SensorSource):
         weights = stretch_weights(lag.clamp_max(samples * epoch.dt), torch.zeros_like(span), samples, epoch.dt)
         forward = stack_limits(epoch.start.C_nb[..., 0], epoch.window.C_nb[..., 0])
         north, east, down = weighted_mean(weights, forward).unbind(-1)
-        axis, level = epoch.frame.axis_n, north.square() + east.square()
-        convergence = -epoch.window.end.p_n[:, 1] * axis[:, 2] / (axis[:, 0] * epoch.frame.radius)
+        axis, p_n, level = epoch.frame.axis_n, epoch.window.end.p_n, north.square() + east.square()
+        eastward = axis[:, 0] * p_n[:, 1] - axis[:, 1] * p_n[:, 0]  # · cos φ
+        convergence = -eastward * axis[:, 2] / (axis[:, :2].square().sum(-1) * epoch.frame.radius)
         expected = torch.atan2(east, north) + convergence + prediction.parameters["heading_offset"]
         turn = value - expected
         z = torch.atan2(torch.sin(turn), torch.cos(turn))

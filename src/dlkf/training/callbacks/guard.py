@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+from typing import Any
 
 import lightning as L
 import torch
@@ -12,6 +13,10 @@ from lightning.pytorch.callbacks import Callback
 from dlkf.base.errors import InputError
 
 RISEN = 2.0  # an epoch whose mean loss is above the least by more than so many times its size did not end well
+
+
+OF_GROUP = ("lr", "initial_lr", "max_lr", "min_lr")  # rates in a group of the parameters
+OF_SCHEDULE = ("base_lrs", "max_lrs", "eta_min")  # rates in a schedule
 
 
 class StepGuard(Callback):
@@ -43,10 +48,10 @@ class StepGuard(Callback):
             self.skipped += 1
             self.in_a_row += 1
             if self.in_a_row >= self.patience:
-                self._go_back(module, optimizer)
+                self._go_back(trainer, module, optimizer)
         module.log("train/skipped_steps", float(self.skipped), on_step=False, on_epoch=True, reduce_fx="max")
 
-    def _go_back(self, module: L.LightningModule, optimizer) -> None:
+    def _go_back(self, trainer: L.Trainer, module: L.LightningModule, optimizer) -> None:
         if self.good is None or self.returned >= self.returns:
             raise InputError(
                 f"training stopped: {self.in_a_row} steps in a row had non-finite gradients"
@@ -56,17 +61,9 @@ class StepGuard(Callback):
         module.load_state_dict(self.good)
         self.returned, self.in_a_row = self.returned + 1, 0
         optimizer.state.clear()
-
-    def rate_factor(self) -> float:
-        """What the returns so far made of the learning rate."""
-        return self.slower**self.returned
-
-    def on_train_batch_start(self, trainer: L.Trainer, module: L.LightningModule, batch, step: int) -> None:
-        """Apply the slower rate on top of the schedule."""
-        if self.returned:
-            scheduled = trainer.lr_scheduler_configs[0].scheduler.get_last_lr()
-            for group, base in zip(trainer.optimizers[0].param_groups, scheduled):
-                group["lr"] = base * self.rate_factor()
+        scale_rates(optimizer, self.slower)
+        for config in trainer.lr_scheduler_configs:
+            scale_schedule(config.scheduler, self.slower)
 
     def on_train_batch_end(self, trainer: L.Trainer, module: L.LightningModule, outputs, batch, step: int) -> None:
         """Remember the loss."""
@@ -97,3 +94,17 @@ class StepGuard(Callback):
         """A run that goes on starts from good weights."""
         if trainer.current_epoch:
             self.good = copy.deepcopy(module.state_dict())
+
+
+def scale_rates(optimizer: torch.optim.Optimizer, factor: float) -> None:
+    """Multiply the rates of every group of an optimizer."""
+    for group in optimizer.param_groups:
+        group |= {name: factor * group[name] for name in OF_GROUP if name in group}
+
+
+def scale_schedule(schedule: Any, factor: float) -> None:
+    """Multiply the rates that a schedule comes back to, also those of one that is made of others."""
+    for part in (schedule, *getattr(schedule, "_schedulers", ())):
+        for name in OF_SCHEDULE:
+            if rate := getattr(part, name, None):
+                setattr(part, name, [factor * x for x in rate] if isinstance(rate, list) else factor * rate)
