@@ -115,6 +115,7 @@ def test_without_a_c_compiler(command, arguments, copy, call, tmp_path, monkeypa
         is_refused(ended, "no C compiler found", folder=tmp_path)
     else:
         assert ended.code == 0 and "not checked: no C compiler here" in ended.out, ended.err
+        assert "plus as C in made here: " in ended.out
         assert "Try it: cd 'made here' && cmake" in ended.out  # as a shell takes it
         assert "plus needs samples at 50 Hz or more" in ended.out
         made = tmp_path / "made here"
