@@ -99,11 +99,18 @@ def require_empty(folder: str | Path, *, overwrite: bool) -> None:
 
 
 def require_store(folder: str | Path) -> None:
-    """InputError where a place is no name at all, in a store that cannot be had, or in a bucket that is not there."""
+    """InputError where a place is no name at all, at a link that points nowhere, in a store that cannot be had, or in a
+    bucket that is not there."""
     if folder == "":
         raise InputError("out= is empty; give a folder")
     place: Any = resolve_place(folder)
-    if not is_url(folder) or "memory" in place.fs.protocol:
+    if not is_url(folder):
+        target = place.expanduser().absolute()
+        for path in (target, *target.parents):
+            if os.path.islink(path) and not os.path.exists(path):
+                raise InputError(f"out={folder}: {path} is a link to {os.readlink(path)}, which is not there; make it")
+        return
+    if "memory" in place.fs.protocol:
         return
     bucket = place.path.lstrip("/").partition("/")[0]
     with store_errors_as_input_error(folder):
