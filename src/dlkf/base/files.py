@@ -108,7 +108,7 @@ def require_store(folder: str | Path) -> None:
         target = place.expanduser().absolute()
         for path in (target, *target.parents):
             if os.path.islink(path) and not os.path.exists(path):
-                raise InputError(f"out={folder}: {path} is a link to {os.readlink(path)}, which is not there; make it")
+                raise InputError(f"out={folder}: {path} points nowhere (to {os.readlink(path)}); give another folder")
         return
     if "memory" in place.fs.protocol:
         return
