@@ -148,9 +148,16 @@ def replace_file(path: str | Path) -> Iterator[Path]:
     beside = target.with_name(f".{target.name}.{uuid.uuid4().hex[:12]}")  # as two workers may write the same file
     try:
         yield beside
+        sync_file(beside)
         os.replace(beside, target)
     finally:
         beside.unlink(missing_ok=True)
+
+
+def sync_file(path: Path) -> None:
+    """Bring a file from memory to the disk: renamed without that, it may be empty after a power cut."""
+    with path.open("rb") as file:
+        os.fsync(file.fileno())
 
 
 @contextmanager
