@@ -209,7 +209,7 @@ def write_into(folder: str | Path) -> Iterator[Path]:
         return
     target = Path(os.path.abspath(Path(folder).expanduser()))
     restore_folder(target)
-    _clear_dead(target, PARTIAL)
+    clear_dead(target, PARTIAL)
     whole = not os.path.lexists(target)
     created = [p for p in (target.parent, *target.parents) if not p.exists()]
     waiting = f"{PARTIAL}{process_label()}"
@@ -255,13 +255,14 @@ def restore_folder(target: Path) -> None:
 
     What one had begun is removed. A folder that had been moved aside for a new one, which then did not come, is back.
     """
-    _clear_dead(target.parent, f".{target.name}{PARTIAL}")
+    clear_dead(target.parent, f".{target.name}{PARTIAL}")
     for old in _find_dead(target.parent, f".{target.name}{OLD}"):
         with suppress(OSError):  # another command is at it as well
             shutil.rmtree(old) if target.exists() else old.rename(target)
 
 
-def _clear_dead(parent: Path, begins: str) -> None:
+def clear_dead(parent: Path, begins: str) -> None:
+    """Remove folders that begin so and whose process, of this machine, is gone."""
     for left in _find_dead(parent, begins):
         shutil.rmtree(left, ignore_errors=True)
 
