@@ -15,7 +15,7 @@ from typing import NoReturn
 
 import dlkf
 from dlkf.base.errors import did_you_mean
-from dlkf.base.own_process import end_at_once, keep_freed_memory
+from dlkf.base.own_process import end_at_once, keep_freed_memory, print_any_letter
 
 COMMANDS = {
     "simulate": "drives with known truth, as a dataset",
@@ -42,6 +42,7 @@ def program() -> None:
 
 def main() -> None:
     """Run a command; 2 for an unknown one, 130 after Ctrl-C, even while the libraries load."""
+    print_any_letter()
     word, rest = (sys.argv[1] if len(sys.argv) > 1 else "help"), sys.argv[2:]
     before = signal.signal(signal.SIGTERM, _terminate)
     try:

@@ -65,8 +65,8 @@ def main(settings: ExportSettings) -> None:
         tables = read_drive(dataset, drive_rows(dataset, settings.drive)[0], reference=False)
         drive = drive_from_tables(tables, "", given["rate_hz"], given["epoch_s"], torch.float64, find_tables(model))
         layout = write_source(folder, model, grid, name, describe_provenance())
-        for name in COPIED:
-            (folder / name).write_text((EXAMPLES / name).read_text())
+        for example in COPIED:
+            (folder / example).write_text((EXAMPLES / example).read_text())
         write_log(folder / "drive.csv", tables)
         if find_compiler() is None:
             lines = ["not checked: no C compiler here (cc, gcc or clang)"]

@@ -123,7 +123,7 @@ def main(settings: NavigateSettings) -> None:
         (folder / "report.html").write_text(page, encoding="utf-8")
         left_out = [f"left out: {reason}" for reason in (skipped or {}).values()]
         said = "\n".join((*sorted(lines), *left_out, *summary_lines(shown, courses), *warnings))
-        (folder / LOG).write_text(f"{said}\n")
+        (folder / LOG).write_text(f"{said}\n", encoding="utf-8")
     print(said)
     print(f"Solutions: {settings.out}/drive=*/solution.parquet; report: {settings.out}/report.html")
 

@@ -27,7 +27,7 @@ def main(settings: RegisterSettings) -> None:
         folder = model_folder(settings.model)
         with start_run(uri, "models", settings.model) as run:
             if (card := folder / CARD_TEXT).is_file():
-                run.note(card.read_text())
+                run.note(card.read_text(encoding="utf-8"))
             log_model(run, folder)
         run_id = run.id
     else:

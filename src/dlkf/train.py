@@ -28,7 +28,7 @@ from dlkf.tracking.registry import check_registration, log_model
 from dlkf.tracking.runs import check_store, lightning_logger, start_run, tracking_uri
 from dlkf.training.fit import check_fit
 from dlkf.training.processes import is_worker
-from dlkf.training.run_folder import check_digests, run_folder, write_state
+from dlkf.training.run_folder import check_digests, hold_folder, run_folder, write_state
 from dlkf.training.settings import TrainSettings, drop_unused
 from dlkf.training.study import (
     key_metrics,
@@ -73,7 +73,8 @@ def main(config: dict[str, Any]) -> None:
         console.print(f"resuming the unfinished run in {folder}")
     name = run_name(given.name, overrides)
     parent = os.environ.get(PARENT_RUN)
-    with start_run(uri, given.name, name, parent_run_id=parent, run_id=state.get("run_id")) as run:
+    begun = start_run(uri, given.name, name, parent_run_id=parent, run_id=state.get("run_id"))
+    with hold_folder(folder), begun as run:
         write_state(folder, run_id=run.id, **check_digests(data.datasets, config, state))
         run.log_config(drop_unused(config))
         for dataset in data.datasets:

@@ -99,6 +99,27 @@ def test_output_that_cannot_be_written_ends_as_usual():
     assert done.returncode == 120
 
 
+@pytest.mark.whole
+@pytest.mark.parametrize(
+    "given",
+    [{"PYTHONIOENCODING": "latin-1"}, {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}],
+    ids=["latin-1", "ascii"],
+)
+def test_an_encoding_without_some_letters_fails_no_command(given, town, tmp_path):
+    """They are question marks on the screen, and as they are in files."""
+
+    def run(*words: object) -> subprocess.CompletedProcess[bytes]:
+        command = [sys.executable, "-m", *map(str, words)]
+        return subprocess.run(command, cwd=tmp_path, env=os.environ | given, capture_output=True, timeout=PATIENCE_S)
+
+    for words in (("dlkf",), ("dlkf", "navigate", "--help"), ("dlkf.navigate", "--help")):
+        done = run(*words)
+        assert done.returncode == 0 and b"key=value" in done.stdout and not done.stderr, done.stderr
+    done = run("dlkf.navigate", "model=mbkf15", f"dataset={town}", "rate_hz=10", "out=made")
+    assert done.returncode == 0 and b"final 1? " in done.stdout, done.stderr
+    assert "final 1σ " in (tmp_path / "made" / "log.txt").read_text(encoding="utf-8")
+
+
 def test_every_command_has_a_module_and_every_configured_one_is_listed():
     here = Path(dlkf.__file__).parent
     assert all((here / f"{name}.py").is_file() for name in COMMANDS)

@@ -54,6 +54,26 @@ def test_an_older_result_is_not_written_over(command, copy, call, tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("out", "said"),
+    [
+        ("a" * 300, "the name is too long for this disk"),
+        ("logs/loop", "nowhere"),
+        ("logs/loop/made", "nowhere"),
+        ("logs/dangling", "/dangling points nowhere (to gone); give another"),
+        ("logs/dangling/made", "/dangling points nowhere"),
+    ],
+    ids=["long", "loop", "in a loop", "dangling", "in a dangling one"],
+)
+def test_a_place_that_cannot_be_made(out, said, copy, call, tmp_path):
+    (tmp_path / "logs").mkdir()
+    (tmp_path / "logs" / "loop").symlink_to("loop")
+    (tmp_path / "logs" / "dangling").symlink_to("gone")
+    is_refused(call("navigate", "model=ins", "dataset=town", f"out={out}"), said, folder=tmp_path)
+    is_refused(call("simulate", "dataset=one_imu", f"out={out}"), said, folder=tmp_path)
+    assert len(list((tmp_path / "logs").iterdir())) == 2
+
+
+@pytest.mark.parametrize(
     ("error", "said"),
     [
         (OSError(28, "No space left on device", "/data/x"), "the disk is full"),
@@ -115,6 +135,7 @@ def test_without_a_c_compiler(command, arguments, copy, call, tmp_path, monkeypa
         is_refused(ended, "no C compiler found", folder=tmp_path)
     else:
         assert ended.code == 0 and "not checked: no C compiler here" in ended.out, ended.err
+        assert "plus as C in made here: " in ended.out
         assert "Try it: cd 'made here' && cmake" in ended.out  # as a shell takes it
         assert "plus needs samples at 50 Hz or more" in ended.out
         made = tmp_path / "made here"

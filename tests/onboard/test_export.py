@@ -34,6 +34,7 @@ from dlkf.onboard.core import Core
 from dlkf.onboard.core_drives import run_core_drive
 from dlkf.onboard.functions import Turn, make_layout
 from dlkf.onboard.library import LIBRARY, Library, build, find_compiler
+from dlkf.onboard.library_cache import seal
 from dlkf.onboard.meanings import describe_column
 from dlkf.onboard.recording import export_mode, record
 from dlkf.running.batched import run_filter
@@ -228,6 +229,7 @@ def test_it_is_made_once_and_can_be_put_away(exported, tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     kept = tmp_path / "dlkf" / "compiled" / compiled_filter._digest(estimator, GRID)
     shutil.copytree(folder, kept)  # made before
+    seal(kept)
     made = compiled_filter.compile_filter(estimator, 50.0, 1.0)
     again = pickle.loads(pickle.dumps(made))
     assert again.grid == made.grid and again.layout.size == made.layout.size

@@ -3,6 +3,7 @@
 import os
 import re
 import signal
+import time
 from contextlib import nullcontext
 from importlib import import_module
 
@@ -18,7 +19,7 @@ from dlkf.data.masks import Outage
 from dlkf.filters.saved import parse_learned_settings
 from dlkf.training.fit import check_fit, fit
 from dlkf.training.module import FilterTraining
-from dlkf.training.run_folder import check_digests, read_state, run_folder, write_state
+from dlkf.training.run_folder import check_digests, hold_folder, read_state, run_folder, write_state
 from dlkf.training.settings import FitSettings, TrainSettings, drop_unused
 from dlkf.training.study import list_seen_recordings, model_card
 from tests.shell import PATIENCE_S, start_fork
@@ -193,6 +194,59 @@ def test_the_card_of_a_model_says_that_the_code_was_changed(dataset, monkeypatch
     monkeypatch.setattr("dlkf.training.study.repository_commit", lambda: "0123456789+")
     study = settings_from(TrainSettings, settings(), "").study
     assert model_card(study, data(dataset), None)["commit"] == "0123456789+"
+
+
+@pytest.mark.parametrize("name", ["state.json", "last.ckpt"])
+@pytest.mark.parametrize("left", [0, 0.5, 0.99])
+def test_a_damaged_file_of_an_unfinished_run_is_named(name, left, tmp_path):
+    """As a full disk or a power cut leaves it; with resume=false the folder is not read."""
+    folder, _ = run_folder("a", "0123", resume=True, root=tmp_path)
+    write_state(folder, run_id="abc")
+    torch.save({"state_dict": {"weight": torch.ones(999)}}, folder / "last.ckpt")
+    assert run_folder("a", "0123", resume=True, root=tmp_path) == (folder, {"run_id": "abc"})
+    whole = (folder / name).read_bytes()
+    (folder / name).write_bytes(whole[: int(left * len(whole))])
+    with pytest.raises(InputError, match=rf"{folder}/{name} is damaged; remove {folder} or give resume=false"):
+        run_folder("a", "0123", resume=True, root=tmp_path)
+    assert run_folder("a", "0123", resume=False, root=tmp_path)[0].name == "0123-2"
+
+
+@pytest.mark.whole
+def test_a_checkpoint_with_other_bytes_is_damaged(tmp_path):
+    """Of the right length, as a disk that lost a block leaves it."""
+    folder = tmp_path / "a" / "0123"
+    folder.mkdir(parents=True)
+    torch.save({"weight": torch.ones(9999)}, folder / "last.ckpt")
+    with (folder / "last.ckpt").open("r+b") as file:
+        file.seek(20000)
+        file.write(bytes(512))
+    with pytest.raises(InputError, match=r"last\.ckpt is damaged"):
+        run_folder("a", "0123", resume=True, root=tmp_path)
+
+
+@pytest.mark.whole
+def test_of_two_processes_with_one_run_the_second_is_refused(tmp_path):
+    """Until the first ends, even by SIGKILL."""
+
+    def hold():
+        with hold_folder(tmp_path / "run"):
+            (tmp_path / "there").touch()
+            signal.pause()
+
+    process = start_fork(tmp_path, tmp_path / "said", hold)
+    end = time.monotonic() + PATIENCE_S
+    while not (tmp_path / "there").exists():
+        assert process.is_alive() and time.monotonic() < end, (tmp_path / "said").read_text()
+        time.sleep(0.01)
+    with (
+        pytest.raises(InputError, match=r"the same training is running in .*/run; wait"),
+        hold_folder(tmp_path / "run"),
+    ):
+        pytest.fail("two in one folder")
+    process.kill()
+    process.join(PATIENCE_S)
+    with hold_folder(tmp_path / "run"):
+        pass
 
 
 def test_run_folder_is_found_again_until_it_is_finished(tmp_path):

@@ -34,7 +34,7 @@ def make_console(width: int = 110) -> Console:
 def save_log(console: Console, folder: str | Path) -> None:
     """The lines printed so far, as the folder's ``log.txt``."""
     with replace_file(f"{folder}/{LOG}") as beside:
-        beside.write_text(console.export_text(clear=False))
+        beside.write_text(console.export_text(clear=False), encoding="utf-8")
 
 
 @cache

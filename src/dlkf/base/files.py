@@ -99,11 +99,18 @@ def require_empty(folder: str | Path, *, overwrite: bool) -> None:
 
 
 def require_store(folder: str | Path) -> None:
-    """InputError where a place is no name at all, in a store that cannot be had, or in a bucket that is not there."""
+    """InputError where a place is no name at all, at a link that points nowhere, in a store that cannot be had, or in a
+    bucket that is not there."""
     if folder == "":
         raise InputError("out= is empty; give a folder")
     place: Any = resolve_place(folder)
-    if not is_url(folder) or "memory" in place.fs.protocol:
+    if not is_url(folder):
+        target = place.expanduser().absolute()
+        for path in (target, *target.parents):
+            if os.path.islink(path) and not os.path.exists(path):
+                raise InputError(f"out={folder}: {path} points nowhere (to {os.readlink(path)}); give another folder")
+        return
+    if "memory" in place.fs.protocol:
         return
     bucket = place.path.lstrip("/").partition("/")[0]
     with store_errors_as_input_error(folder):
@@ -141,9 +148,16 @@ def replace_file(path: str | Path) -> Iterator[Path]:
     beside = target.with_name(f".{target.name}.{uuid.uuid4().hex[:12]}")  # as two workers may write the same file
     try:
         yield beside
+        sync_file(beside)
         os.replace(beside, target)
     finally:
         beside.unlink(missing_ok=True)
+
+
+def sync_file(path: Path) -> None:
+    """Bring a file from memory to the disk: renamed without that, it may be empty after a power cut."""
+    with path.open("rb") as file:
+        os.fsync(file.fileno())
 
 
 @contextmanager
@@ -195,7 +209,7 @@ def write_into(folder: str | Path) -> Iterator[Path]:
         return
     target = Path(os.path.abspath(Path(folder).expanduser()))
     restore_folder(target)
-    _clear_dead(target, PARTIAL)
+    clear_dead(target, PARTIAL)
     whole = not os.path.lexists(target)
     created = [p for p in (target.parent, *target.parents) if not p.exists()]
     waiting = f"{PARTIAL}{process_label()}"
@@ -241,13 +255,14 @@ def restore_folder(target: Path) -> None:
 
     What one had begun is removed. A folder that had been moved aside for a new one, which then did not come, is back.
     """
-    _clear_dead(target.parent, f".{target.name}{PARTIAL}")
+    clear_dead(target.parent, f".{target.name}{PARTIAL}")
     for old in _find_dead(target.parent, f".{target.name}{OLD}"):
         with suppress(OSError):  # another command is at it as well
             shutil.rmtree(old) if target.exists() else old.rename(target)
 
 
-def _clear_dead(parent: Path, begins: str) -> None:
+def clear_dead(parent: Path, begins: str) -> None:
+    """Remove folders that begin so and whose process, of this machine, is gone."""
     for left in _find_dead(parent, begins):
         shutil.rmtree(left, ignore_errors=True)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import atexit
+import io
 import os
 import sys
 import threading
@@ -29,6 +30,13 @@ def end_at_once() -> None:
         return
     atexit._run_exitfuncs()
     os._exit(0)
+
+
+def print_any_letter() -> None:
+    """What the encoding of the output lacks, as σ in Latin-1, is printed as a question mark."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
 
 
 def keep_freed_memory() -> None:

@@ -18,6 +18,7 @@ import dlkf
 from dlkf.base.config import config_dir
 from dlkf.base.errors import InputError, Terminated
 from dlkf.base.files import resolve_place
+from dlkf.base.own_process import print_any_letter
 from dlkf.base.settings import Settings, settings_from
 from dlkf.command import sweeps
 from dlkf.command.arguments import (
@@ -78,6 +79,7 @@ def command(
 
         @wraps(function)
         def main() -> None:
+            print_any_letter()
             if {"--help", "-h"} & set(sys.argv[1:]):
                 print_help(name)
                 return

@@ -19,6 +19,8 @@ OF_THE_DISK = {
     errno.EROFS: "the disk is read-only; run from a folder that can be written to",
     errno.EACCES: "permission denied; run from a folder that can be written to, or change its permissions",
     errno.EPERM: "permission denied; run from a folder that can be written to, or change its permissions",
+    errno.ENAMETOOLONG: "the name is too long for this disk; give a shorter one",
+    errno.ELOOP: "its links point nowhere but to each other; give another path",
 }
 # what an exception says: what it means
 SAID = {
@@ -37,6 +39,7 @@ SAID = {
     "whether dlkf doctor finds faulty samples or fixes, and whether imu= fits the IMU",
     r"can't allocate memory|Unable to allocate|not enough memory": "the memory of this machine is full; give fewer or "
     "shorter drives, or a smaller model",
+    r"Symlink loop from": "the links of a path point nowhere but to each other; give another one",
     r"invalid accelerator name|[Yy]ou selected an invalid": "trainer.accelerator is unknown; known: auto, cpu, gpu",
 }
 LISTED = ("aids", "datasets", "drives", "export", "model", "models", "runs")  # keys that take a list of words

@@ -38,7 +38,7 @@ KEY = re.compile(r"(?P<indent> *)(?P<key>\w+):(?: (?P<value>[^#]*))?(?:# (?P<say
 
 def help_text(name: str, aliases: Mapping[str, str]) -> str:
     """The page of a command; ``aliases``: what a user writes for a group that has another folder."""
-    text = (config_dir() / f"{name}.yaml").read_text()
+    text = (config_dir() / f"{name}.yaml").read_text(encoding="utf-8")
     head = [line.removeprefix("# ").removeprefix("#") for line in _head(text)]
     lines = [*head, "", "Presets (key=name; a folder given by --config-dir adds to them):"]
     for group in list_groups(text):
@@ -109,7 +109,7 @@ def describe_key(text: str, key: str) -> tuple[str, str]:
 
 
 def _in_preset(folder: Path, choice: str, key: str) -> tuple[str, str]:
-    text = (folder / f"{choice}.yaml").read_text()
+    text = (folder / f"{choice}.yaml").read_text(encoding="utf-8")
     own = list_keys(text)
     if key in own:
         return own[key]

@@ -200,7 +200,9 @@ def write_found(path: Path, mappings: Sequence[dict[str, Any]]) -> None:
         "#   python -m dlkf.ingest --config-dir <this dataset> reader=found source=<the logs> out=<another dataset>\n"
     )
     with replace_file(path) as beside:
-        beside.write_text(head + yaml.safe_dump(_merge_values(mappings), sort_keys=False, allow_unicode=True))
+        beside.write_text(
+            head + yaml.safe_dump(_merge_values(mappings), sort_keys=False, allow_unicode=True), encoding="utf-8"
+        )
 
 
 def _merge_values(values: Sequence[Any]) -> Any:

@@ -190,6 +190,6 @@ def write_consistency(
         for name, r in results.items()
     }
     with write_into(out) as folder:
-        (folder / "table.md").write_text(as_markdown(table))
+        (folder / "table.md").write_text(as_markdown(table), encoding="utf-8")
         (folder / "consistency.png").write_bytes(png(draw_consistency(results, outage)))
-        (folder / "consistency.json").write_text(as_json(series))
+        (folder / "consistency.json").write_text(as_json(series), encoding="utf-8")

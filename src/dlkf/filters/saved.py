@@ -48,7 +48,7 @@ def save_filter(model: Learned, folder: Path | str, card: Mapping[str, Any] | No
     save_file({k: v.detach().cpu().contiguous() for k, v in model.state_dict().items()}, folder / WEIGHTS)
     (folder / CONFIG).write_text(yaml.safe_dump(model.config.as_dict(), sort_keys=False))
     if card is not None:
-        (folder / CARD).write_text(yaml.safe_dump(dict(card), sort_keys=False, allow_unicode=True))
+        (folder / CARD).write_text(yaml.safe_dump(dict(card), sort_keys=False, allow_unicode=True), encoding="utf-8")
 
 
 def choose_grid(

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pandas as pd
-import yaml
 
 from dlkf.base.config import config_dir
+from dlkf.base.documents import read_yaml
 from dlkf.frames.checks import (
     check_above_zero,
     check_imu_type,
@@ -235,4 +235,4 @@ def _align() -> Any:
     from dlkf.base.settings import settings_from
     from dlkf.data.alignment import AlignConfig
 
-    return settings_from(AlignConfig, yaml.safe_load((config_dir() / "navigate.yaml").read_text())["align"], "align")
+    return settings_from(AlignConfig, read_yaml(config_dir() / "navigate.yaml")["align"], "align")

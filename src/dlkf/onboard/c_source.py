@@ -128,7 +128,7 @@ def write_source(
     values = _sizes(estimator, layout, grid, name, max(x.work for x in done.values()), done)
     room = max(int(values["WORK"]), -(-of_search.work // 8) + 2 * of_search.size)
     values |= {"WORK": room, **of_search.sizes(), **_aids(estimator)}
-    (folder / "step.h").write_text(_fill((CORE / "step.h.in").read_text(), values))
+    (folder / "step.h").write_text(_fill((CORE / "step.h.in").read_text(), values), encoding="utf-8")
     if loop_alone:
         return layout
     (folder / "heading.c").write_text(write_preamble() + of_search.code)
@@ -140,7 +140,7 @@ def write_source(
         "row": [{"name": c, "place": k, "meaning": describe_column(c)} for k, c in enumerate(list_columns(estimator))],
         "memory": {"numbers": layout.size, "type": "float64", "fields": [f.as_dict() for f in layout.fields]}, **made,
     }  # fmt: skip
-    (folder / "step.json").write_text(json.dumps(described, indent=1, ensure_ascii=False) + "\n")
+    (folder / "step.json").write_text(json.dumps(described, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
     return layout
 
 

@@ -9,9 +9,6 @@ covariances but their diagonals, and no device but the CPU.
 from __future__ import annotations
 
 import hashlib
-import os
-import shutil
-import tempfile
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache, cached_property
@@ -47,7 +44,8 @@ from dlkf.onboard.functions import (
     pack_fix,
     split_outputs,
 )
-from dlkf.onboard.library import FLAGS, LIBRARY, Library, build, describe_machine, find_compiler
+from dlkf.onboard.library import FLAGS, Library, build, describe_machine, find_compiler, require_compiler
+from dlkf.onboard.library_cache import find_cache, load_cached
 from dlkf.running.bridging import Stretch, bridge, find_covariance
 from dlkf.running.reanchoring import FrameChange, can_reanchor, reanchor
 
@@ -232,29 +230,26 @@ def compile_filter(estimator: Filter, rate_hz: float, epoch_s: float, whole: boo
     """A filter compiled for a grid; from the cache where it has been made before.
 
     ``whole``: with the core of a vehicle round it (:mod:`dlkf.onboard.core`), which takes longer to make. Raises
-    InputError where there is no C compiler, or the filter is smoothed or cannot be exported.
+    InputError where there is no C compiler, the cache cannot be written to, or the filter is smoothed or cannot be
+    exported.
     """
     if isinstance(estimator, SmoothedSolution):
         raise InputError("a smoothed filter runs in torch, which keeps its covariances; leave compiled=true out")
     grid = Grid(round(rate_hz * epoch_s), 1 / rate_hz)
-    folder = _find_cache() / (_digest(estimator, grid) + ("-core" if whole else ""))
-    if not (folder / LIBRARY).is_file():
-        if find_compiler() is None:
-            build(folder)  # says so
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        beside = Path(tempfile.mkdtemp(dir=folder.parent))
-        try:
+    folder = find_cache() / (_digest(estimator, grid) + ("-core" if whole else ""))
+    if folder not in _LOADED:
+
+        def make(beside: Path) -> None:
+            require_compiler()  # before all the work
             write_source(beside, estimator, grid, type(estimator).__name__, {}, loop_alone=not whole)
             build(beside)
-            if not (folder / LIBRARY).is_file():
-                shutil.rmtree(folder, ignore_errors=True)
-                os.replace(beside, folder)
-        finally:
-            shutil.rmtree(beside, ignore_errors=True)
-    if folder not in _LOADED:
-        with torch.no_grad(), without_loops():
-            layout = make_layout(estimator, grid)
-        _LOADED[folder] = layout, Library(folder / LIBRARY, layout.size, count_output_numbers(estimator))
+
+        def load(path: Path) -> tuple[Layout, Library]:
+            with torch.no_grad(), without_loops():
+                layout = make_layout(estimator, grid)
+            return layout, Library(path, layout.size, count_output_numbers(estimator))
+
+        _LOADED[folder] = load_cached(folder, make, load)
     return CompiledFilter(estimator, grid, *_LOADED[folder], whole=whole)
 
 
@@ -262,13 +257,9 @@ def compile_or_keep(estimator: Estimator, rate_hz: float, epoch_s: float) -> Est
     """:func:`compile_filter`, or the filter itself where it cannot be compiled, with a line that says why."""
     try:
         return compile_filter(estimator, rate_hz, epoch_s)
-    except (InputError, OSError) as error:  # OSError: a cache that cannot be written, a library that cannot be loaded
+    except InputError as error:
         warn_once(f"trials run in torch, some 3 × slower: {error}")
         return estimator
-
-
-def _find_cache() -> Path:
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "dlkf" / "compiled"
 
 
 @cache

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import ctypes
 import os
+import platform
 import shutil
 import subprocess
 import sysconfig
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 
 import torch
@@ -27,6 +29,8 @@ CORE_FLAGS = ("-O2",)
 FILTER = ("step.c", "weights.c", "heading.c")
 CORE = ("dlkf.c", "samples.c", "spikes.c", "align.c", "search.c", "aids.c", "limits.c")
 LIBRARY = "step.so"
+CPUINFO = Path("/proc/cpuinfo")
+OF_PROCESSOR = ("model name", "flags", "CPU implementer", "CPU part", "Features", "isa")  # lines of it
 
 
 def find_compiler() -> str | None:
@@ -35,14 +39,19 @@ def find_compiler() -> str | None:
     return next((found for name in (*given, "cc", "gcc", "clang") if (found := shutil.which(name))), None)
 
 
+def require_compiler() -> str:
+    """:func:`find_compiler`. InputError where there is none."""
+    if (cc := find_compiler()) is None:
+        raise InputError("no C compiler found (cc, gcc, clang, or $CC); install one, such as apt-get install gcc")
+    return cc
+
+
 def build(folder: Path, into: Path | None = None, flags: Sequence[str] | None = None) -> Path:
     """Compile what was exported to a folder, the filter with ``flags``; default: :data:`FLAGS`.
 
     Raises InputError where there is no compiler, or it fails.
     """
-    cc = find_compiler()
-    if cc is None:
-        raise InputError("no C compiler found (cc, gcc, clang, or $CC); install one, such as apt-get install gcc")
+    cc = require_compiler()
     into = (into or folder).resolve()
     objects = []
     for names, own in ((FILTER, FLAGS if flags is None else flags), (CORE, CORE_FLAGS)):
@@ -92,6 +101,11 @@ def _pointer(x: Tensor) -> ctypes.c_void_p:
     return ctypes.c_void_p(x.data_ptr())
 
 
+@cache
 def describe_machine() -> str:
-    """What a library was made for."""
-    return sysconfig.get_platform()
+    """What a library was made for: system, and by ``-march=native`` the processor with its instructions."""
+    try:
+        lines = CPUINFO.read_text(errors="replace").splitlines()
+    except OSError:
+        return f"{sysconfig.get_platform()} {platform.processor()}"
+    return "\n".join([sysconfig.get_platform(), *sorted({line for line in lines if line.startswith(OF_PROCESSOR)})])

@@ -230,7 +230,9 @@ def simulate(
         shown = track(written, f"simulating {config.name}", total=len(jobs), disable=unseen, console=console)
         with closing(shown) as rows:  # type: ignore[type-var]
             write_drives_table(folder, list(rows))
-        (folder / "simulation.json").write_text(json.dumps(made_by.described, indent=2, ensure_ascii=False) + "\n")
+        (folder / "simulation.json").write_text(
+            json.dumps(made_by.described, indent=2, ensure_ascii=False) + "\n", encoding="utf-8"
+        )
     return out
 
 

@@ -68,7 +68,9 @@ def simulate_semi_real(
         write_drives_table(folder, written)
         validate_dataset(folder)
         settings = {"source": str(source), **made_by.described}
-        (folder / "simulation.json").write_text(json.dumps(settings, indent=2, ensure_ascii=False) + "\n")
+        (folder / "simulation.json").write_text(
+            json.dumps(settings, indent=2, ensure_ascii=False) + "\n", encoding="utf-8"
+        )
     return out
 
 

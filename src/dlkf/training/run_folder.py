@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import errno
+import fcntl
 import json
-from collections.abc import Mapping, Sequence
+import zipfile
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -11,30 +15,67 @@ from dlkf.base.errors import InputError
 from dlkf.base.files import replace_file
 from dlkf.base.own_code import digest_modules, find_own_modules
 from dlkf.data.store import dataset_digest
+from dlkf.training.callbacks.checkpoints import LAST
 
 STATE = "state.json"
+LOCK = "lock"
 
 
 def run_folder(
     name: str, digest: str, *, resume: bool, root: Path = Path("outputs/train")
 ) -> tuple[Path, dict[str, Any]]:
-    """Folder and state of the unfinished run of a configuration's ``digest``, or a new one with an empty state."""
+    """Folder and state of the unfinished run of a configuration's ``digest``, or a new one with an empty state.
+
+    InputError where a file that the run would go on from is damaged.
+    """
     base = root / name / digest
     attempt = 1
     while True:
         folder = base.with_name(base.name if attempt == 1 else f"{base.name}-{attempt}")
         if not folder.exists():
             return folder, {}
-        state = read_state(folder)
-        if resume and not state.get("finished"):
+        if resume and not (state := read_state(folder)).get("finished"):
+            if (last := folder / LAST).is_file():
+                with _damaged_as_input_error(last), zipfile.ZipFile(last) as parts:  # as torch writes it
+                    if parts.testzip():
+                        raise zipfile.BadZipFile
             return folder, state
         attempt += 1
 
 
 def read_state(folder: Path) -> dict[str, Any]:
-    """The state file, empty where there is none."""
+    """The state file, empty where there is none. InputError for a damaged one."""
     path = folder / STATE
-    return json.loads(path.read_text()) if path.is_file() else {}
+    if not path.is_file():
+        return {}
+    with _damaged_as_input_error(path):
+        return dict(json.loads(path.read_text()))
+
+
+@contextmanager
+def _damaged_as_input_error(path: Path) -> Iterator[None]:
+    """Whatever reading a file raises in the block but an OSError."""
+    try:
+        yield
+    except OSError:
+        raise
+    except Exception:
+        raise InputError(f"{path} is damaged; remove {path.parent} or give resume=false") from None
+
+
+@contextmanager
+def hold_folder(folder: Path) -> Iterator[None]:
+    """The folder is this process's alone during the block. InputError where another one of this training has it."""
+    folder.mkdir(parents=True, exist_ok=True)
+    with (folder / LOCK).open("a") as file:
+        try:
+            fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # which ends with the process, however that ends
+        except OSError as error:
+            if error.errno in (errno.EACCES, errno.EAGAIN):  # else a disk without locks
+                raise InputError(
+                    f"the same training is running in {folder}; wait for its end, or give resume=false for another one"
+                ) from None
+        yield
 
 
 def check_digests(

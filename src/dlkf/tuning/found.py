@@ -40,6 +40,6 @@ def write_noise(out: str | Path, found: NoiseFit, table: ResultTable) -> list[st
         for kind, values in (("imu", preset), ("tuning", asdict(found.tuning))):
             (folder / kind).mkdir()
             text = f"# {table.title}\n{yaml.safe_dump(values, sort_keys=False)}"
-            (folder / kind / f"{name}.yaml").write_text(text)
-        (folder / "table.md").write_text(as_markdown(table))
+            (folder / kind / f"{name}.yaml").write_text(text, encoding="utf-8")
+        (folder / "table.md").write_text(as_markdown(table), encoding="utf-8")
     return [f"imu/{name}.yaml", f"tuning/{name}.yaml", "table.md"]

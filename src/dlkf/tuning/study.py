@@ -185,8 +185,8 @@ def write_tuning(out: str | Path, name: str, result: TuningResult, table: Result
     trials = pd.DataFrame(result.trials, columns=["factor", "value", "objective"])
     with write_into(out) as folder:
         (folder / "tuning").mkdir()
-        (folder / "tuning" / f"{name}.yaml").write_text(factors)
-        (folder / "table.md").write_text(as_markdown(table))
+        (folder / "tuning" / f"{name}.yaml").write_text(factors, encoding="utf-8")
+        (folder / "table.md").write_text(as_markdown(table), encoding="utf-8")
         trials.to_csv(folder / "search.csv", index=False, lineterminator="\n")
-        (folder / "errors.json").write_text(json.dumps(result.metrics(), indent=1) + "\n")
+        (folder / "errors.json").write_text(json.dumps(result.metrics(), indent=1) + "\n", encoding="utf-8")
     return [f"tuning/{name}.yaml", "table.md", "search.csv"]
