@@ -9,9 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pandas as pd
-import yaml
 
-from dlkf.base.config import config_dir
 from dlkf.frames.checks import (
     check_above_zero,
     check_imu_type,
@@ -96,6 +94,7 @@ def navigate(
     """
     import torch
 
+    from dlkf.data.alignment import read_align
     from dlkf.data.kinds import drive_rates
     from dlkf.data.store import choose_aids, load_dataset
     from dlkf.filters.aids.attach import describe_aids, find_tables, with_aids
@@ -123,7 +122,7 @@ def navigate(
         fixes = UsableFixes.of(folder, DRIVE)
         grid = choose_grid([estimator], rate_hz, epoch_s, choose_epoch([fixes], rate_hz or 50.0, estimator))
         drives = load_dataset(folder, dtype=torch.float64, reference=False, aids=find_tables(estimator), **grid)
-        (navigated,) = navigate_drives(drives, estimator, align=_align())
+        (navigated,) = navigate_drives(drives, estimator, align=read_align())
     solution = Solution.of(navigated, fixes, short_name(model), REMEDY if takes_tuning(model) else OF_NETWORK)
     for line in (*unused, *slow, *([solution.warning] if solution.warning else [])):
         warnings.warn(line, UserWarning, stacklevel=_depth())
@@ -228,11 +227,3 @@ def Stream(
         estimator = add_chosen_aids(short_name(check_model(model)), estimator, aids)
     grid = choose_grid([estimator], rate_hz, epoch_s, 1.0)
     return StreamingFilter(estimator, **grid, lever_arm_b=arm, **options)
-
-
-def _align() -> Any:
-    """How ``dlkf navigate`` starts a drive."""
-    from dlkf.base.settings import settings_from
-    from dlkf.data.alignment import AlignConfig
-
-    return settings_from(AlignConfig, yaml.safe_load((config_dir() / "navigate.yaml").read_text())["align"], "align")
