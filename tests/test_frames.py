@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import pickle
 import re
 import subprocess
 import sys
@@ -106,6 +107,15 @@ def test_a_solution_shows_and_writes_itself(drive, tmp_path):
     assert len(points) == len(solution) and "2025-07-05T10:01" in (place / "solution.kml").read_text()
     solution.export(tmp_path / "town", "gpx")
     assert "<time>" not in (place / "solution.gpx").read_text()  # t counts from 0: no date
+
+
+def test_a_solution_can_be_pickled(drive):
+    """With its summary, its track and its fixes."""
+    solution = dlkf.navigate(drive["imu"], drive["gnss"], model="ins", rate_hz=10)
+    again = pickle.loads(pickle.dumps(solution))
+    assert type(again) is dlkf.Solution and again.summary == solution.summary and again.warning is solution.warning
+    pd.testing.assert_frame_equal(pd.DataFrame(again), pd.DataFrame(solution), check_exact=True)
+    assert again._repr_html_() == solution._repr_html_() and len(again.map().data) == len(solution.map().data)
 
 
 @pytest.mark.whole

@@ -34,7 +34,7 @@ class Solution(pd.DataFrame):
     warning: str | None
     _navigated: Navigated
     _fixes: UsableFixes
-    _metadata = ("summary", "warning", "_navigated", "_fixes")
+    _metadata = ["summary", "warning", "_navigated", "_fixes"]  # noqa: RUF012  pandas adds a list to it
 
     @classmethod
     def of(cls, navigated: Navigated, fixes: UsableFixes, model: str, remedy: str) -> Solution:
