@@ -20,6 +20,7 @@ from dlkf.data.limits import LEVER_ARM_M
 
 LONGEST_SHOWN = 80  # letters of a wrong value in a line
 CODES = range(10)  # of NMEA's GGA sentence
+NOT_IN_PYTHON = (("imu", "auto"), ("simulated", "semi_real"))  # presets of commands alone
 SHOWN = 12  # columns in a line
 OTHER_NAMES = {  # what people call the contract's columns, beside what the readers know (dlkf.data.readers.vocabulary)
     "t": ("time", "timestamp", "time_s", "seconds", "stamp", "date"),
@@ -299,7 +300,7 @@ def check_whole(name: str, value: Any, least: int) -> int:
 
 def check_preset(group: str, name: Any, argument: str = "") -> None:
     """InputError for a name that is no preset of ``conf/<group>``, with the closest."""
-    known = [name for name in preset_names(group) if (group, name) != ("imu", "auto")]
+    known = [name for name in preset_names(group) if (group, name) not in NOT_IN_PYTHON]
     if not isinstance(name, str):
         raise InputError(f"{argument or group} is {_shorten(name)}, must be the name of a preset: {', '.join(known)}")
     if name not in known:

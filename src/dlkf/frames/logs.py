@@ -36,7 +36,8 @@ def simulate(
     seed : int
         The same seed gives the same drives.
     imu_type : str, optional
-        A preset of ``conf/imu``; default: the preset's own.
+        A preset of ``conf/imu``; default: the preset's own. Of ``fleet`` and ``other_imus``, which draw the type of
+        each drive, none.
 
     Returns
     -------
@@ -48,12 +49,14 @@ def simulate(
     InputError
         For a preset that does not exist, and for no time or no drives.
     """
-    from dlkf.command.simulated import compose_recipe
+    from dlkf.command.simulated import SEMI_REAL, compose_recipe
     from dlkf.data.readers.frames import DriveFrames
     from dlkf.data.schema import drive_file
     from dlkf.data.tables import read_drives_table
     from dlkf.simulation.dataset import simulate as simulate_dataset
 
+    if preset == SEMI_REAL:
+        raise InputError(f"preset={SEMI_REAL!r} needs real drives: dlkf simulate source=<dataset of real drives>")
     check_preset("simulated", preset)
     if imu_type is not None:
         check_preset("imu", imu_type, "imu_type")
@@ -64,6 +67,9 @@ def simulate(
     words = [f"simulated@dataset={preset}", f"dataset.hours={minutes * drives / 60}", f"seed={seed}"]
     words += [f"dataset.drive_minutes={minutes}", *([f"imu={imu_type}"] if imu_type else [])]
     recipe = compose_recipe(*words)
+    if imu_type is not None and recipe.dataset.imu_errors == "fleet":
+        kinds = ", ".join(kind.name for kind in recipe.dataset.fleet.values())
+        raise InputError(f"imu_type has no effect on preset={preset!r}: the IMU of each drive is one of {kinds}")
     with TemporaryDirectory(prefix="dlkf-") as folder:
         out = Path(folder) / "simulated"
         simulate_dataset(recipe, out, progress=False)
