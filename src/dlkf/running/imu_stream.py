@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -19,6 +20,13 @@ Row = Sequence[float] | np.ndarray
 COLUMNS = ("t", *ACCEL, *GYRO)
 BEFORE = 3  # stamps kept before the open epoch: an interval is resampled with the one before it
 ASTRAY_S = 1.0  # samples out of line that go on for so long are the truth, and the line before was not
+
+
+def to_floats(*values: Any) -> tuple[float, ...]:
+    """TypeError or ValueError where one is no number, as text with a number in it is not."""
+    if any(isinstance(x, (str, bytes)) for x in values):
+        raise TypeError
+    return tuple(map(float, values))
 
 
 class ImuStream:
@@ -80,7 +88,7 @@ class ImuStream:
     def find_refusal(self, t: float, accel: Row, gyro: Row) -> str:
         """Take a sample (s, m/s², rad/s); a reason if it cannot be, else nothing."""
         try:
-            row = (float(t), *map(float, accel), *map(float, gyro))
+            row = to_floats(t, *accel, *gyro)
         except (TypeError, ValueError, OverflowError):
             return "t, accel or gyro holds what is no number"
         if len(row) != 7:
