@@ -40,7 +40,7 @@ OPTIONAL_OF_GNSS = {  # what the readers call a quantity: the contract's column 
 
 def check_frames(imu: Any, gnss: Any, reference: Any = None, aids: Mapping[str, Any] | None = None) -> None:
     """InputError for what is no frame, has no rows, lacks columns, or has text or dates where numbers belong."""
-    from dlkf.data.schema import AIDS, OPTIONAL, SCHEMAS
+    from dlkf.data.schema import AIDS, OPTIONAL, SCHEMAS, VELOCITY
 
     frames = {"imu": imu, "gnss": gnss, "reference": reference, **(aids or {})}
     for name, frame in frames.items():
@@ -61,6 +61,11 @@ def check_frames(imu: Any, gnss: Any, reference: Any = None, aids: Mapping[str, 
         _check_numbers(name, frame, [c for c in (*schema.names, *more.names) if c in frame])
         if not len(frame):
             raise InputError(f"{name} has no rows")
+    if reference is not None and (unknown := [c for c in VELOCITY if c not in reference or reference[c].isna().all()]):
+        raise InputError(
+            f"reference: {', '.join(unknown)} missing; errors are measured against positions and velocities, and "
+            "without reference= against the drive smoothed with its fixes"
+        )
     _check_seconds({name: frame["t"].to_numpy(float) for name, frame in frames.items() if frame is not None})
     _check_quality(gnss)
     if len(horizontal := [c for c in ("vel_n", "vel_e") if c in gnss]) == 1:
@@ -272,6 +277,14 @@ def check_models(models: Any) -> list[str]:
     if twice := sorted({name for name in checked if checked.count(name) > 1}):
         raise InputError(f"models: {', '.join(twice)} stands twice; name each filter once")
     return checked
+
+
+def check_aids(aids: Any) -> list[str]:
+    """One or several sensors' names."""
+    names = [aids] if isinstance(aids, str) else aids
+    if not isinstance(names, (list, tuple)) or not all(isinstance(name, str) for name in names):
+        raise InputError(f"aids is {_shorten(aids)}, must be a name or a list of names such as ['speed']")
+    return list(names)
 
 
 def check_imu_type(imu_type: Any) -> None:
