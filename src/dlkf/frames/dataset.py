@@ -23,6 +23,7 @@ IN_PYTHON = (  # what a line advises for logs on disk, and what it is for frames
     (r"; lower align\.min_speed or leave the drive out", "; give a longer part of the drive, with turns and speed"),
     (r"; reference=smoothed or gnss needs none", "; without reference= the drive smoothed with its fixes is one"),
     (r"; give smaller ones, or outage=null", "; give a smaller outage_s, or a longer drive"),
+    (r" or give tracking\.uri=…", " or set MLFLOW_TRACKING_URI"),
     (r"^smoother=rts needs", "smoothed=True needs"),
     (
         r": give prior\.mean and prior\.std .*",
