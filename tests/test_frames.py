@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import pickle
 import re
 import subprocess
 import sys
@@ -108,6 +109,15 @@ def test_a_solution_shows_and_writes_itself(drive, tmp_path):
     assert "<time>" not in (place / "solution.gpx").read_text()  # t counts from 0: no date
 
 
+def test_a_solution_can_be_pickled(drive):
+    """With its summary, its track and its fixes."""
+    solution = dlkf.navigate(drive["imu"], drive["gnss"], model="ins", rate_hz=10)
+    again = pickle.loads(pickle.dumps(solution))
+    assert type(again) is dlkf.Solution and again.summary == solution.summary and again.warning is solution.warning
+    pd.testing.assert_frame_equal(pd.DataFrame(again), pd.DataFrame(solution), check_exact=True)
+    assert again._repr_html_() == solution._repr_html_() and len(again.map().data) == len(solution.map().data)
+
+
 @pytest.mark.whole
 def test_a_filter_that_is_too_sure_of_itself_is_said(drive):
     """A tenth of the preset's noise: one line with the remedy; a filter tuned for any car has none."""
@@ -131,6 +141,76 @@ def test_logs_are_read_by_a_preset_that_builds_on_another(tmp_path):
     """reader=ubx is csv's settings with its own."""
     with pytest.raises(dlkf.InputError, match="no file"):
         dlkf.read_logs(tmp_path, "ubx")
+
+
+def test_logs_are_read_by_a_file_of_one_s_own(drive, tmp_path):
+    """As ``--config-dir`` does: only what differs from the preset that it builds on."""
+    imu, gnss = drive["imu"].copy(), drive["gnss"]
+    accel = [f"accel_{a}" for a in "xyz"]
+    imu[accel] /= 9.80665
+    (tmp_path / "logs").mkdir()
+    imu.rename(columns={"t": "seconds"}).to_csv(tmp_path / "logs" / "imu.csv", index=False)
+    gnss.to_csv(tmp_path / "logs" / "gnss.csv", index=False)
+    own = tmp_path / "shed, 1.yaml"
+    own.write_text(
+        "defaults: [csv, _self_]\ntime_zero: keep\nlever_arm_m: [0.5, 0.0, -1.2]\n"
+        "imu: {time: {column: seconds}, accel: {unit: g}}\n"
+    )
+    (read,) = dlkf.read_logs(tmp_path / "logs", own)
+    assert np.allclose(read.imu[accel], drive["imu"][accel], atol=1e-9) and read.meta["lever_arm_z_m"] == -1.2
+    (other,) = dlkf.read_logs(tmp_path / "logs", str(own), "reader.lever_arm_m=[0,0,0]")
+    assert other.meta["lever_arm_z_m"] == 0.0
+    for text, says in (
+        ("defaults: [csw, _self_]\n", "unknown preset or config 'reader/csw'"),
+        ("defaults: [csv, _self_]\nimu: {accel: {unitt: g}}\n", "unitt"),
+        ("imu: [\n", "shed, 1.yaml"),
+        ("7\n", "shed, 1.yaml"),
+    ):
+        own.write_text(text)
+        with pytest.raises(dlkf.InputError, match=says) as error:
+            dlkf.read_logs(tmp_path / "logs", own)
+        assert "\n" not in str(error.value)
+    with pytest.raises(dlkf.InputError, match="no such file"):
+        dlkf.read_logs(tmp_path / "logs", tmp_path / "none.yaml")
+
+
+WARNED = """
+import warnings, dlkf
+with warnings.catch_warnings(record=True) as said:
+    warnings.simplefilter("always")
+    dlkf.Stream("plus", rate_hz=10)
+    dlkf.Stream("plus", tuning="any_car")
+    stream = dlkf.Stream("plus")
+    for k in range(100):
+        stream.imu(k / 10, (0.1 * (k % 2), 0.0, -9.8), (0.0, 0.0, 0.0))
+        if k % 10 == 0:
+            stream.gnss(k / 10, 48.0, 11.0, 500.0)
+print([(w.category.__name__, w.filename, w.lineno) for w in said])
+"""
+
+
+@pytest.mark.whole
+def test_warnings_name_the_line_of_the_caller():
+    """A stream's too, whether the rate is known from the start or seen in its samples. In a process of its own: here
+    the checks of shapes are calls in between."""
+    out = subprocess.run([sys.executable, "-c", WARNED], capture_output=True, text=True, check=True).stdout
+    low, user = "LowSampleRateWarning", "UserWarning"
+    assert eval(out) == [(low, "<string>", 5), (user, "<string>", 6), (low, "<string>", 9)]
+
+
+def test_numbers_as_text_are_refused_by_a_stream():
+    stream = dlkf.Stream("plus", aids="speed")
+    for receipt in (
+        stream.gnss("0", 48.0, 11.0, 500.0),
+        stream.gnss(0.0, "48", 11.0, 500.0),
+        stream.gnss(0.0, 48.0, 11.0, 500.0, ("1", "0", "0")),
+        stream.imu("0", (0.0, 0.0, -9.8), (0.0, 0.0, 0.0)),
+        stream.imu(0.0, (0.0, 0.0, b"-9.8"), (0.0, 0.0, 0.0)),
+        stream.speed("1", 5.0),
+        stream.speed(1.0, "5"),
+    ):
+        assert receipt.status == "refused" and "number" in receipt.reason
+    assert stream.gnss(0.0, 48, np.float32(11), 500.0).status == "taken"
 
 
 def test_a_stream_navigates(drive):

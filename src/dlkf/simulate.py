@@ -6,11 +6,13 @@ import math
 import time
 
 import numpy as np
+from hydra.core.hydra_config import HydraConfig
 
 from dlkf.base.callable_module import make_callable
 from dlkf.base.errors import InputError
 from dlkf.base.files import resolve_place
-from dlkf.command import command
+from dlkf.command import command, list_typed_words
+from dlkf.command.simulated import SEMI_REAL
 from dlkf.data.tables import read_drives_table
 from dlkf.simulation.dataset import SimulateSettings, simulate
 from dlkf.simulation.semi_real import simulate_semi_real
@@ -19,7 +21,7 @@ from dlkf.simulation.semi_real import simulate_semi_real
 def choose_dataset(arguments: list[str]) -> list[str]:
     """``source=`` alone means the dataset ``semi_real``, not simulated drives' default."""
     given = {argument.partition("=")[0].removeprefix("simulated@") for argument in arguments}
-    return [*arguments, "dataset=semi_real"] if "source" in given and "dataset" not in given else arguments
+    return [*arguments, f"dataset={SEMI_REAL}"] if "source" in given and "dataset" not in given else arguments
 
 
 @command("simulate", SimulateSettings, choose_dataset)
@@ -27,6 +29,14 @@ def main(settings: SimulateSettings) -> None:
     """Write the dataset to ``out`` (default ``data/<name>``) and print what it holds."""
     start = time.perf_counter()
     out = resolve_place(settings.out)
+    chosen = HydraConfig.get().runtime.choices.get("simulated@dataset")
+    if chosen == SEMI_REAL and not settings.source:
+        raise InputError(f"dataset={SEMI_REAL} needs source=<dataset of real drives>")
+    if settings.recipe.dataset.imu_errors == "fleet" and (typed := list_typed_words("imu")):
+        raise InputError(
+            f"{typed[0]} has no effect: the IMU of each drive is drawn from dataset.fleet; "
+            "dataset.imu_errors=per_drive gives every drive a unit of imu="
+        )
     if settings.source and settings.recipe.dataset.sensors:
         raise InputError("sensors= belongs to simulated drives; leave it out with source=")
     if settings.source:

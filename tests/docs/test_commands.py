@@ -125,6 +125,19 @@ def as_hydra_takes_it(command: str, word: str) -> str:
     return quote_argument(f"{groups[key]}@{key}={value}" if equals and key in groups else word)
 
 
+def test_blocks_do_not_write_into_each_other_s_folders() -> None:
+    """A reader follows the front page, then others: where two lines differ, so do their folders."""
+    lines: dict[str, dict[tuple[str, ...], str]] = {}
+    for page in PAGES:
+        if not {"results", "tutorials", "RESULTS.md"}.intersection(page.parts):
+            for block in (b for b in blocks(page) if not b.language and not b.file):
+                for words in map(spelt_out, commands(block.text)):
+                    for out in (word for word in words if word.startswith("out=") and word != "out=mine"):
+                        lines.setdefault(out, {})[tuple(words)] = page.name
+    assert len(lines) > 30
+    assert not [(out, list(where.values())) for out, where in lines.items() if len(where) > 1]
+
+
 @pytest.mark.whole
 @pytest.mark.parametrize("lines", [SHELL, PRESETS], ids=["pages", "presets"])
 def test_every_command_line_exists(lines: list[tuple[Path, tuple[str, ...]]], mine: Path) -> None:

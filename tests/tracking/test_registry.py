@@ -18,17 +18,17 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
+import dlkf
 from dlkf.base.errors import InputError
 from dlkf.data.rows import example_drive
 from dlkf.data.schema import drive_file
-from dlkf.data.store import load_dataset
 from dlkf.filters.learned import LearnedConfig, LearnedFilter
 from dlkf.filters.saved import load_filter, save_filter
-from dlkf.running.offline import navigate_drives
 from dlkf.tracking.comparison import choose_best
 from dlkf.tracking.grid import PARENT_RUN, GridParent
 from dlkf.tracking.registry import REQUIRED, check_registration, download_model, log_model, register_model
 from dlkf.tracking.runs import mlflow_module, start_run
+from tests.cars import write_cars
 from tests.docs.pages import ROOT
 from tests.shell import PATIENCE_S
 
@@ -85,19 +85,19 @@ def test_an_alias_moves_to_the_newer_version(logged, uri, client, weights):
 
 
 def test_the_pyfunc_gives_what_navigate_gives(logged, uri, weights, cars):
-    """Same rows to the last bit: the same code ran. Folders and a table of the drives mean the same."""
+    """Same rows from the first fix on, to the rounding of drives that run together. Folders and a table of the drives
+    mean the same."""
     mlflow = mlflow_module()
     mlflow.set_tracking_uri(uri)
     model = mlflow.pyfunc.load_model("models:/town@champion")
     (call,) = re.findall(r"mlflow\.pyfunc\.load_model\(.*?\)\.predict\(.*?\)", TRAINING_PAGE.read_text())
     given = eval(call.replace("outage@", "town@").replace("data/town", str(cars)))
     pd.testing.assert_frame_equal(given, model.predict(pd.DataFrame({"dataset": [str(cars)]})))
-    drives = load_dataset(cars, rate_hz=50.0, epoch_s=1.0, dtype=torch.float64, reference=False)
-    wanted = {r.drive: r.table for r in navigate_drives(drives, load_filter(weights))}
+    wanted = {f"car-{k}": navigate_car(cars, f"car-{k}", weights) for k in range(2)}
     assert set(given.drive) == set(wanted) and set(given.dataset) == {str(cars)}
     for drive, rows in given.groupby("drive"):
         pd.testing.assert_frame_equal(
-            rows.drop(columns=["dataset", "drive"]).reset_index(drop=True), wanted[drive], check_exact=True
+            rows.drop(columns=["dataset", "drive"]).reset_index(drop=True), wanted[drive], rtol=1e-9, atol=1e-9
         )
     table = pd.concat(
         pd.read_parquet(drive_file(cars, kind, drive), partitioning=None).assign(drive=drive)
@@ -109,6 +109,25 @@ def test_the_pyfunc_gives_what_navigate_gives(logged, uri, weights, cars):
     assert set(example.drive) == {"example"} and np.isfinite(example.vel_n).all() and len(example) >= 8
     with pytest.raises(Exception, match="lacks accel_x"):
         model.predict(table.drop(columns="accel_x"))
+
+
+def navigate_car(folder, drive, model) -> pd.DataFrame:
+    """What ``dlkf.navigate`` makes of the tables of a drive."""
+    kinds = [kind for kind in ("imu", "gnss", "speed", "heading", "baro") if (folder / kind).is_dir()]
+    tables = {k: pd.read_parquet(drive_file(folder, k, drive), partitioning=None) for k in kinds}
+    return pd.DataFrame(dlkf.navigate(tables.pop("imu"), tables.pop("gnss"), model=model, **tables))
+
+
+def test_the_pyfunc_takes_the_sensors_of_a_folder(call, uri, tmp_path):
+    """``plus`` with wheel speed, heading and barometer, as ``navigate`` takes them, on fixes 4 s apart."""
+    assert call("register", "model=plus", "name=plus", f"tracking.uri={uri}").code == 0
+    mlflow = mlflow_module()
+    mlflow.set_tracking_uri(uri)
+    folder = write_cars(tmp_path / "wheels", aids={}, seconds=40.0, gnss_hz=0.25)
+    given = mlflow.pyfunc.load_model("models:/plus/1").predict({"dataset": [str(folder)]})
+    assert given["speed_used"].sum() > 5 and given["heading_used"].sum() > 5 and given["baro_used"].sum() > 5
+    wanted = navigate_car(folder, "car-0", "plus")
+    pd.testing.assert_frame_equal(given.drop(columns=["dataset", "drive"]), wanted, check_exact=True)
 
 
 def test_the_filter_that_comes_along_is_registered_with_its_card(uri, call):
@@ -215,9 +234,20 @@ def test_a_network_of_one_s_own_comes_with_its_model(uri, client, cars, tmp_path
     shutil.rmtree(mine)
     mlflow = mlflow_module()
     mlflow.set_tracking_uri(uri)
-    monkeypatch.setattr(sys, "path", list(sys.path))
+    before = list(sys.path)
+    monkeypatch.setattr(sys, "path", list(before))
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", uri)
     answer = mlflow.pyfunc.load_model("models:/town@champion").predict({"dataset": [str(cars)]})
     assert len(answer) > 20 and np.isfinite(answer.vel_n).all()
+    for name in names:
+        del sys.modules[name]
+    monkeypatch.setattr(sys, "path", list(before))
+    with pytest.raises(InputError, match="No module named 'mean_network'"):
+        load_filter(tmp_path / "best")
+    again = navigate_car(cars, "car-0", "models:/town@champion")
+    one = answer[answer.drive == "car-0"].drop(columns=["dataset", "drive"])
+    pd.testing.assert_frame_equal(again, one, rtol=1e-9, atol=1e-9)
+    assert sys.path[: len(before)] == before, "what is installed comes first"
     for name in names:
         del sys.modules[name]
 
@@ -238,6 +268,7 @@ def test_a_logged_model_brings_its_code_and_no_pickle(logged, uri, cars):
         "import dlkf\n"
         f"assert dlkf.__file__.startswith({str(folder)!r}), dlkf.__file__\n"
         "assert not {'hydra', 'lightning', 'omegaconf'} & set(sys.modules)\n"
+        "dlkf.Stream('mbkf15', imu_type='consumer')\n"  # its presets came along
     )
     done = subprocess.run(
         [sys.executable, "-c", program],

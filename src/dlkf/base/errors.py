@@ -1,8 +1,11 @@
 """A user's mistake, and the end that a signal asks for."""
 
 import difflib
+import sys
 from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 
+PACKAGE = str(Path(__file__).parents[1])
 LONGEST_LINE = 200  # letters of a message of another library
 CLOSE = 0.7  # difflib's ratio from which on another name is worth naming
 
@@ -36,6 +39,14 @@ def list_some(names: Sequence[str], most: int = 8) -> str:
     """The first of several names, and how many more there are: ``a, b and 5 more``."""
     more = f" and {len(names) - most} more" if len(names) > most else ""
     return ", ".join(names[:most]) + more
+
+
+def count_calls() -> int:
+    """How many calls away the code is that called this package: the ``stacklevel`` of a warning that names its line."""
+    frame, calls = sys._getframe(1), 1
+    while frame.f_back is not None and frame.f_code.co_filename.startswith(PACKAGE):
+        frame, calls = frame.f_back, calls + 1
+    return calls
 
 
 def no_drives(skipped: Mapping[str, str] | None = None) -> InputError:

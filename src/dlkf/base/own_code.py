@@ -8,7 +8,7 @@ import shutil
 import sys
 import sysconfig
 from collections.abc import Iterator, Mapping
-from importlib.util import resolve_name
+from importlib.util import find_spec, resolve_name
 from pathlib import Path
 from typing import Any
 
@@ -45,10 +45,18 @@ def digest_modules(modules: Mapping[str, Path]) -> dict[str, str]:
 
 def copy_modules(modules: Mapping[str, Path], folder: Path) -> list[Path]:
     """The files below ``folder`` by their paths; returns what lies in it."""
+    folder.mkdir(parents=True, exist_ok=True)
     for path, file in modules.items():
         (folder / path).parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(file, folder / path)
     return sorted(folder.iterdir())
+
+
+def find_missing_modules(config: Any, folder: Path) -> None:
+    """Put ``folder`` behind the path where a module of the classes named in a configuration is not on it."""
+    names = {name.partition(".")[0] for name in _list_modules(config)} - {""}
+    if folder.is_dir() and any(name not in sys.modules and find_spec(name) is None for name in names):
+        sys.path.append(str(folder))
 
 
 def _list_modules(config: Any) -> Iterator[str]:

@@ -13,10 +13,13 @@ import math
 from dataclasses import dataclass
 
 import torch
+import yaml
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from dlkf.base.config import config_dir
 from dlkf.base.errors import InputError
+from dlkf.base.settings import settings_from
 from dlkf.data.drive import Drive
 from dlkf.data.velocity_fit import MOTION_SIGMAS, antenna_velocity, scale_std
 from dlkf.navigation.attitude import prefix_rotations, rotation_from_rpy, rotation_from_vector, rpy_from_rotation
@@ -57,6 +60,12 @@ class AlignConfig:
 
 ALIGN = AlignConfig()  # the course
 SEARCH = AlignConfig(search_s=20.0)
+
+
+def read_align() -> AlignConfig:
+    """How ``dlkf navigate`` starts a drive: ``align`` of ``conf/navigate.yaml``."""
+    values = yaml.safe_load((config_dir() / "navigate.yaml").read_text(encoding="utf-8"))
+    return settings_from(AlignConfig, values["align"], "align")
 
 
 @dataclass(frozen=True)

@@ -170,7 +170,7 @@ class Scenes:
     def _align(self, drives: Sequence[Drive], config: AlignConfig) -> dict[int, Start]:
         scored = [k for k, drive in enumerate(drives) if bool(drive.ref_valid.any())]
         for k in sorted(set(range(len(drives))) - set(scored)):
-            lacks = "has no valid reference to score against; reference=smoothed or gnss needs none"
+            lacks = "the reference has no valid row with position and velocity; reference=smoothed or gnss needs none"
             self.skipped[drives[k].name] = f"drive {drives[k].name}: {lacks}"
         starts: dict[int, Start] = {}
         for k, start in zip(scored, align_each([drives[k] for k in scored], config)):

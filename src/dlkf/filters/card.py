@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from dlkf.base.documents import read_yaml
-from dlkf.base.errors import InputError
+from dlkf.base.errors import InputError, count_calls
 from dlkf.data.kinds import drive_imus, drive_rates
 from dlkf.data.tables import DriveRow
 
@@ -89,7 +89,7 @@ def warn_slow_drives(model: object, rate_hz: float) -> bool:
     """Whether a stream is too slow for a filter, which is a warning (:class:`LowSampleRateWarning`)."""
     lines = describe_slow_drives({"the filter": model}, [rate_hz], "this stream has")
     for line in lines:
-        warnings.warn(line, LowSampleRateWarning, stacklevel=3)
+        warnings.warn(line, LowSampleRateWarning, stacklevel=count_calls())
     return bool(lines)
 
 

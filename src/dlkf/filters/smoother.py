@@ -23,7 +23,7 @@ from dlkf.filters.integration import BatchSolution, Estimator, integrate
 from dlkf.filters.model_based import has_covariance
 from dlkf.navigation.state import IMU, PVA, STATES, NavState
 
-NO_COVARIANCE = "smoother=rts needs a filter with a covariance: mbkf15, mbkf21, mbkf33 or aekf, with their endings"
+NO_COVARIANCE = "smoother=rts needs a filter with a covariance: plus, or mbkf15, mbkf21, mbkf33, aekf with endings"
 ROUNDING = 1e-13  # added to unit variances
 
 

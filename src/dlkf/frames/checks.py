@@ -20,6 +20,7 @@ from dlkf.data.limits import LEVER_ARM_M
 
 LONGEST_SHOWN = 80  # letters of a wrong value in a line
 CODES = range(10)  # of NMEA's GGA sentence
+NOT_IN_PYTHON = (("imu", "auto"), ("simulated", "semi_real"))  # presets of commands alone
 SHOWN = 12  # columns in a line
 OTHER_NAMES = {  # what people call the contract's columns, beside what the readers know (dlkf.data.readers.vocabulary)
     "t": ("time", "timestamp", "time_s", "seconds", "stamp", "date"),
@@ -39,7 +40,7 @@ OPTIONAL_OF_GNSS = {  # what the readers call a quantity: the contract's column 
 
 def check_frames(imu: Any, gnss: Any, reference: Any = None, aids: Mapping[str, Any] | None = None) -> None:
     """InputError for what is no frame, has no rows, lacks columns, or has text or dates where numbers belong."""
-    from dlkf.data.schema import AIDS, OPTIONAL, SCHEMAS
+    from dlkf.data.schema import AIDS, OPTIONAL, SCHEMAS, VELOCITY
 
     frames = {"imu": imu, "gnss": gnss, "reference": reference, **(aids or {})}
     for name, frame in frames.items():
@@ -60,6 +61,11 @@ def check_frames(imu: Any, gnss: Any, reference: Any = None, aids: Mapping[str, 
         _check_numbers(name, frame, [c for c in (*schema.names, *more.names) if c in frame])
         if not len(frame):
             raise InputError(f"{name} has no rows")
+    if reference is not None and (unknown := [c for c in VELOCITY if c not in reference or reference[c].isna().all()]):
+        raise InputError(
+            f"reference: {', '.join(unknown)} missing; errors are measured against positions and velocities, and "
+            "without reference= against the drive smoothed with its fixes"
+        )
     _check_seconds({name: frame["t"].to_numpy(float) for name, frame in frames.items() if frame is not None})
     _check_quality(gnss)
     if len(horizontal := [c for c in ("vel_n", "vel_e") if c in gnss]) == 1:
@@ -273,6 +279,14 @@ def check_models(models: Any) -> list[str]:
     return checked
 
 
+def check_aids(aids: Any) -> list[str]:
+    """One or several sensors' names."""
+    names = [aids] if isinstance(aids, str) else aids
+    if not isinstance(names, (list, tuple)) or not all(isinstance(name, str) for name in names):
+        raise InputError(f"aids is {_shorten(aids)}, must be a name or a list of names such as ['speed']")
+    return list(names)
+
+
 def check_imu_type(imu_type: Any) -> None:
     """A preset of conf/imu, or what stands in one."""
     if isinstance(imu_type, Mapping):
@@ -299,7 +313,7 @@ def check_whole(name: str, value: Any, least: int) -> int:
 
 def check_preset(group: str, name: Any, argument: str = "") -> None:
     """InputError for a name that is no preset of ``conf/<group>``, with the closest."""
-    known = [name for name in preset_names(group) if (group, name) != ("imu", "auto")]
+    known = [name for name in preset_names(group) if (group, name) not in NOT_IN_PYTHON]
     if not isinstance(name, str):
         raise InputError(f"{argument or group} is {_shorten(name)}, must be the name of a preset: {', '.join(known)}")
     if name not in known:

@@ -23,6 +23,14 @@ IN_PYTHON = (  # what a line advises for logs on disk, and what it is for frames
     (r"; lower align\.min_speed or leave the drive out", "; give a longer part of the drive, with turns and speed"),
     (r"; reference=smoothed or gnss needs none", "; without reference= the drive smoothed with its fixes is one"),
     (r"; give smaller ones, or outage=null", "; give a smaller outage_s, or a longer drive"),
+    (r" or give tracking\.uri=…", " or set MLFLOW_TRACKING_URI"),
+    (r"^smoother=rts needs", "smoothed=True needs"),
+    (
+        r": give prior\.mean and prior\.std .*",
+        ", which only the commands take; give the name without _prior",
+    ),
+    (r", mbkf15_prior", ""),
+    (r"(endings of a Kalman filter: )_prior, ", r"\1"),
     (r"outage\.first_s=60 and outage\.duration_s=", "60 s with GNSS first and outage_s="),
 )
 PLACE = re.compile(rf"drive {DRIVE}, (\w+)(/drive={DRIVE})?")
@@ -47,12 +55,18 @@ def drive_folder(
     unknown = dict.fromkeys((*VELOCITY, *ATTITUDE), np.nan) | {"valid": True}
     truth = None if reference is None else _complete("reference", reference, unknown)
     given = {kind: _complete(kind, frame, {}) for kind, frame in aids.items() if frame is not None}
+    with in_python(), TemporaryDirectory(prefix="dlkf-") as here:
+        folder = Path(here) / "frames"
+        row = write_drive(folder, meta, _complete("imu", imu, {}), fixes, truth, given)
+        write_drives_table(folder, [row])
+        yield folder
+
+
+@contextmanager
+def in_python() -> Iterator[None]:
+    """InputErrors that say what to do in Python, not on a command line (:func:`reword`)."""
     try:
-        with TemporaryDirectory(prefix="dlkf-") as here:
-            folder = Path(here) / "frames"
-            row = write_drive(folder, meta, _complete("imu", imu, {}), fixes, truth, given)
-            write_drives_table(folder, [row])
-            yield folder
+        yield
     except InputError as error:
         raise InputError(reword(str(error))) from None
 

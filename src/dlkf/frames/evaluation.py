@@ -97,7 +97,8 @@ def evaluate(
     imu, gnss : pandas.DataFrame
         As in :func:`dlkf.frames.navigation.navigate`.
     reference : pandas.DataFrame, optional
-        What errors are measured against; without one the drive smoothed with all its fixes.
+        What errors are measured against: t, lat_deg, lon_deg, height_m, vel_n|e|d and, where known, roll, pitch, yaw
+        [rad], valid. Without one: the drive smoothed with all its fixes.
     models : str or sequence of str
         Filters to compare, as ``model`` of :func:`dlkf.frames.navigation.navigate`.
     outage_s : float

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import shutil
 import warnings
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
+from dlkf.base.documents import read_yaml
 from dlkf.base.errors import InputError
 from dlkf.frames.checks import check_above_zero, check_preset, check_switch, check_whole
 
@@ -17,6 +20,7 @@ if TYPE_CHECKING:
     from dlkf.data.intake import IngestResult
     from dlkf.data.readers.frames import DriveFrames
 
+OWN = "own_reader"  # a user's file among the presets of conf/reader
 SHORTEST_MIN, LONGEST_MIN = 0.3, 240.0  # of a simulated drive
 
 
@@ -36,7 +40,8 @@ def simulate(
     seed : int
         The same seed gives the same drives.
     imu_type : str, optional
-        A preset of ``conf/imu``; default: the preset's own.
+        A preset of ``conf/imu``; default: the preset's own. Of ``fleet`` and ``other_imus``, which draw the type of
+        each drive, none.
 
     Returns
     -------
@@ -48,12 +53,14 @@ def simulate(
     InputError
         For a preset that does not exist, and for no time or no drives.
     """
-    from dlkf.command.simulated import compose_recipe
+    from dlkf.command.simulated import SEMI_REAL, compose_recipe
     from dlkf.data.readers.frames import DriveFrames
     from dlkf.data.schema import drive_file
     from dlkf.data.tables import read_drives_table
     from dlkf.simulation.dataset import simulate as simulate_dataset
 
+    if preset == SEMI_REAL:
+        raise InputError(f"preset={SEMI_REAL!r} needs real drives: dlkf simulate source=<dataset of real drives>")
     check_preset("simulated", preset)
     if imu_type is not None:
         check_preset("imu", imu_type, "imu_type")
@@ -64,6 +71,9 @@ def simulate(
     words = [f"simulated@dataset={preset}", f"dataset.hours={minutes * drives / 60}", f"seed={seed}"]
     words += [f"dataset.drive_minutes={minutes}", *([f"imu={imu_type}"] if imu_type else [])]
     recipe = compose_recipe(*words)
+    if imu_type is not None and recipe.dataset.imu_errors == "fleet":
+        kinds = ", ".join(kind.name for kind in recipe.dataset.fleet.values())
+        raise InputError(f"imu_type has no effect on preset={preset!r}: the IMU of each drive is one of {kinds}")
     with TemporaryDirectory(prefix="dlkf-") as folder:
         out = Path(folder) / "simulated"
         simulate_dataset(recipe, out, progress=False)
@@ -75,15 +85,18 @@ def simulate(
         return made
 
 
-def read_logs(source: str | Path, reader: str = "auto", *settings: str, skip_unsure: bool = False) -> list[DriveFrames]:
+def read_logs(
+    source: str | Path, reader: str | Path = "auto", *settings: str, skip_unsure: bool = False
+) -> list[DriveFrames]:
     """Logs in other formats and units as frames in the contract's columns and units, a drive each.
 
     Parameters
     ----------
     source : str or Path
         A file, a folder with one drive, an app's ``.zip``, or a folder with a subfolder or ``.zip`` per drive.
-    reader : str
-        A preset of ``conf/reader``; ``auto`` finds format, units, clocks and mounting.
+    reader : str or Path
+        A preset of ``conf/reader``; ``auto`` finds format, units, clocks and mounting. Or a YAML file of your own with
+        the keys of one, such as ``mine/reader/xsens.yaml``.
     *settings : str
         What is known, as on the command line: ``"reader.imu.accel.unit=g"``, ``"reader.gnss.time.offset_s=0.3"``.
     skip_unsure : bool
@@ -102,15 +115,12 @@ def read_logs(source: str | Path, reader: str = "auto", *settings: str, skip_uns
         For what cannot be read: which file, what is missing, and the setting that mends it.
     """
     from dlkf.base.classes import instantiate
-    from dlkf.command.arguments import quote_argument
-    from dlkf.command.composing import compose_command
     from dlkf.data.intake import read_together
 
     if not isinstance(source, (str, Path)):
         raise InputError(f"source is a {type(source).__name__}, must be the path of a file or a folder with logs")
     if not str(source) or "://" in str(source):
         raise InputError(f"source is {str(source)!r}, must be a file or a folder of this machine")
-    check_preset("reader", reader)
     check_switch("skip_unsure", skip_unsure)
     place = Path(source).expanduser()
     if (place / "drives.parquet").is_file():
@@ -118,9 +128,7 @@ def read_logs(source: str | Path, reader: str = "auto", *settings: str, skip_uns
     for word in settings:
         if not isinstance(word, str) or not word.startswith("reader.") or "=" not in word:
             raise InputError(f"{word!r} is no setting of a reader; one is text such as 'reader.imu.accel.unit=g'")
-    words = [f"++{quote_argument(word)}" for word in settings]
-    values = compose_command("ingest", f"reader={reader}", "source=logs", "out=data", *words)["reader"]
-    opened = instantiate(values, "reader", ("read",))
+    opened = instantiate(_compose_reader(reader, settings), "reader", ("read",))
     if not hasattr(opened, "places"):
         return list(opened.read(str(place)))
     places = opened.places(place)
@@ -132,6 +140,34 @@ def read_logs(source: str | Path, reader: str = "auto", *settings: str, skip_uns
         if not result.rows:
             warnings.warn("; ".join(result.notes), UserWarning, stacklevel=2)
     return [made[name] for _, name, _ in places if name in made]
+
+
+def _compose_reader(reader: str | Path, settings: Sequence[str]) -> Mapping[str, Any]:
+    """The settings of a reader: those of a preset, or of a YAML file with the keys of one."""
+    from dlkf.command.arguments import quote_argument
+    from dlkf.command.composing import compose_command
+    from dlkf.command.faults import describe_fault
+
+    file = Path(reader).expanduser() if isinstance(reader, (str, Path)) else Path()
+    own = file.suffix in (".yaml", ".yml")
+    if not own:
+        check_preset("reader", reader)
+    elif not file.is_file():
+        raise InputError(f"reader is {str(reader)!r}: no such file")
+    elif not isinstance(read_yaml(file), dict):
+        raise InputError(f"{reader} has no keys of a reader; conf/reader/csv.yaml explains them")
+    words = ["source=logs", "out=data", *(f"++{quote_argument(word)}" for word in settings)]
+    with TemporaryDirectory(prefix="dlkf-") as folder:
+        if own:
+            (Path(folder) / "reader").mkdir()
+            shutil.copyfile(file, Path(folder) / "reader" / f"{OWN}.yaml")
+            words.append(f'hydra.searchpath=["file://{Path(folder).as_posix()}"]')
+        try:
+            return compose_command("ingest", f"reader={OWN if own else reader}", *words)["reader"]
+        except Exception as error:
+            if (said := describe_fault(error, "ingest")) is None:
+                raise
+            raise InputError(f"reader {reader}: {said}") from None
 
 
 def _as_frames(drive: DriveFrames) -> IngestResult:

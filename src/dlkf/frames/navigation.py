@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -10,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
-from dlkf.base.config import config_dir
-from dlkf.base.documents import read_yaml
+from dlkf.base.errors import count_calls
 from dlkf.frames.checks import (
     check_above_zero,
+    check_aids,
     check_imu_type,
     check_lever_arm,
     check_model,
@@ -22,7 +21,7 @@ from dlkf.frames.checks import (
     imu_values,
     tuning_values,
 )
-from dlkf.frames.dataset import DRIVE, drive_folder
+from dlkf.frames.dataset import DRIVE, drive_folder, in_python
 from dlkf.frames.solution import Solution
 
 if TYPE_CHECKING:
@@ -30,8 +29,6 @@ if TYPE_CHECKING:
     from dlkf.running.streaming import StreamingFilter
 
 DEFAULT_NOISE = {"imu_type": "automotive_mems", "tuning": "untuned"}
-
-PACKAGE = str(Path(__file__).parents[1])
 
 
 def navigate(
@@ -96,6 +93,7 @@ def navigate(
     """
     import torch
 
+    from dlkf.data.alignment import read_align
     from dlkf.data.kinds import drive_rates
     from dlkf.data.store import choose_aids, load_dataset
     from dlkf.filters.aids.attach import describe_aids, find_tables, with_aids
@@ -123,19 +121,11 @@ def navigate(
         fixes = UsableFixes.of(folder, DRIVE)
         grid = choose_grid([estimator], rate_hz, epoch_s, choose_epoch([fixes], rate_hz or 50.0, estimator))
         drives = load_dataset(folder, dtype=torch.float64, reference=False, aids=find_tables(estimator), **grid)
-        (navigated,) = navigate_drives(drives, estimator, align=_align())
+        (navigated,) = navigate_drives(drives, estimator, align=read_align())
     solution = Solution.of(navigated, fixes, short_name(model), REMEDY if takes_tuning(model) else OF_NETWORK)
     for line in (*unused, *slow, *([solution.warning] if solution.warning else [])):
-        warnings.warn(line, UserWarning, stacklevel=_depth())
+        warnings.warn(line, UserWarning, stacklevel=count_calls())
     return solution
-
-
-def _depth() -> int:
-    """How many calls the caller of this package is away, for a warning that names its line."""
-    frame, depth = sys._getframe(1), 1
-    while frame.f_back is not None and frame.f_code.co_filename.startswith(PACKAGE):
-        frame, depth = frame.f_back, depth + 1
-    return depth
 
 
 def load(
@@ -173,14 +163,15 @@ def load(
     check_imu_type(imu_type)
     given = {"imu_type": imu_type, "tuning": tuning}
     if line := unused_settings(model, [name for name, value in given.items() if value != DEFAULT_NOISE[name]]):
-        warnings.warn(line, UserWarning, stacklevel=3)
-    return resolve_model(model, imu_spec(imu_values(imu_type)), tuning=factors)
+        warnings.warn(line, UserWarning, stacklevel=count_calls())
+    with in_python():
+        return resolve_model(model, imu_spec(imu_values(imu_type)), tuning=factors)
 
 
 def Stream(
     model: str | Path = "plus", *, rate_hz: float | None = None, imu_type: str | Mapping[str, Any] = "automotive_mems",
     tuning: str | Mapping[str, Any] = "untuned", lever_arm: Sequence[float] = (0.0, 0.0, 0.0),
-    aids: Sequence[str] | None = None, **options: Any,
+    aids: str | Sequence[str] | None = None, **options: Any,
 ) -> StreamingFilter:  # fmt: skip
     """A filter fed sample by sample and fix by fix, as in a vehicle.
 
@@ -194,7 +185,7 @@ def Stream(
         As in :func:`navigate`.
     lever_arm : sequence of 3 floats
         IMU → antenna, Forward-Right-Down [m].
-    aids : sequence of str, optional
+    aids : str or sequence of str, optional
         Further sensors that the filter takes, of ``speed``, ``heading`` and ``baro``; a filter with vehicle constraints
         (``_nhc``, ``_car``, ``plus``) does. Their samples go to the methods of these names.
     **options
@@ -225,14 +216,6 @@ def Stream(
     arm = check_lever_arm(options.pop("lever_arm_b", lever_arm))
     estimator = load(model, imu_type=imu_type, tuning=tuning)
     if aids is not None:
-        estimator = add_chosen_aids(short_name(check_model(model)), estimator, aids)
+        estimator = add_chosen_aids(short_name(check_model(model)), estimator, check_aids(aids))
     grid = choose_grid([estimator], rate_hz, epoch_s, 1.0)
     return StreamingFilter(estimator, **grid, lever_arm_b=arm, **options)
-
-
-def _align() -> Any:
-    """How ``dlkf navigate`` starts a drive."""
-    from dlkf.base.settings import settings_from
-    from dlkf.data.alignment import AlignConfig
-
-    return settings_from(AlignConfig, read_yaml(config_dir() / "navigate.yaml")["align"], "align")

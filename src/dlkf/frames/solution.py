@@ -34,7 +34,7 @@ class Solution(pd.DataFrame):
     warning: str | None
     _navigated: Navigated
     _fixes: UsableFixes
-    _metadata = ("summary", "warning", "_navigated", "_fixes")
+    _metadata = ["summary", "warning", "_navigated", "_fixes"]  # noqa: RUF012  pandas adds a list to it
 
     @classmethod
     def of(cls, navigated: Navigated, fixes: UsableFixes, model: str, remedy: str) -> Solution:
@@ -94,7 +94,7 @@ class Solution(pd.DataFrame):
             raise InputError(f"folder is {folder!r}, must be a path")
         if not formats or not isinstance(formats, (str, list, tuple)):
             raise InputError(f"formats is {formats!r}, must be a name or a list of names such as ['gpx', 'kml']")
-        names = choose_formats([formats] if isinstance(formats, str) else list(formats))
+        names = choose_formats([formats] if isinstance(formats, str) else list(formats), "formats")
         clock, counts = _clock(start_utc)
         when = utc_times(self, clock, counts)
         qualities = find_row_qualities(self, self._fixes.t, self._fixes.quality)

@@ -222,15 +222,15 @@ OF_RECEIVERS = ("nmea", "pos")  # formats that have the quality of a fix
 OF_EXTRA = ("mcap", "bag")  # formats that need the extra ``readers``
 
 
-def choose_formats(export: str | list[str] | None) -> list[str]:
-    """Names of formats; ``all`` for every one. InputError for an unknown one."""
+def choose_formats(export: str | list[str] | None, key: str = "export") -> list[str]:
+    """Names of formats; ``all`` for every one. InputError for an unknown one, by the ``key`` that gave it."""
     if export is not None and not isinstance(export, (str, list, tuple)):
-        raise InputError(f"export={export}: must be a format or a list of formats; known: {', '.join(FORMATS)}, all")
+        raise InputError(f"{key}={export}: must be a format or a list of formats; known: {', '.join(FORMATS)}, all")
     names = [] if export is None else [export] if isinstance(export, str) else list(export)
     if names == ["all"]:
         return [n for n in FORMATS if n not in OF_EXTRA or find_spec("rosbags") is not None]
     if unknown := [n for n in names if n not in FORMATS]:
-        raise InputError(f"export={unknown[0]}: unknown format; known: {', '.join(FORMATS)}, all")
+        raise InputError(f"{key}={unknown[0]}: unknown format; known: {', '.join(FORMATS)}, all")
     return names
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -31,6 +31,13 @@ class ClosedEpochs(NamedTuple):
     imu: np.ndarray
     epochs: int
     seconds: tuple[float, float, float] | None  # before, in and after the gap; None: no gap
+
+
+def to_floats(*values: Any) -> tuple[float, ...]:
+    """TypeError or ValueError where one is no number, as text with a number in it is not."""
+    if any(isinstance(x, (str, bytes)) for x in values):
+        raise TypeError
+    return tuple(map(float, values))
 
 
 class ImuStream:
@@ -102,7 +109,7 @@ class ImuStream:
         """Take a sample (s, m/s², rad/s); a reason if it cannot be, else nothing."""
         self.bridged = ""
         try:
-            row = (float(t), *map(float, accel), *map(float, gyro))
+            row = to_floats(t, *accel, *gyro)
         except (TypeError, ValueError, OverflowError):
             return "t, accel or gyro holds what is no number"
         if len(row) != 7:

@@ -13,7 +13,7 @@ from dlkf.data.aids import aid_row
 from dlkf.data.resampling import BLANK, FixRows
 from dlkf.data.schema import POSITION, STD, VELOCITY
 from dlkf.data.validate import GNSS_QUALITIES, usable_fixes
-from dlkf.running.imu_stream import Row
+from dlkf.running.imu_stream import Row, to_floats
 
 NO_FIX = FixRows(
     np.full((1, 3), BLANK["r_e"]), np.full((1, 3), BLANK["v_e"]), np.full((1, 6), BLANK["std"]),
@@ -73,7 +73,7 @@ class MeasurementBuffer:
 def as_number(x: Any) -> float:
     """As float; NaN where it is no number."""
     try:
-        return float(x)
+        return to_floats(x)[0]
     except (TypeError, ValueError, OverflowError):
         return math.nan
 
@@ -87,7 +87,7 @@ def check_fix(
     try:
         if len(velocity_ned) != 3 or len(std) != 6:
             return "velocity_ned must have 3 values, std 6"
-        values = [float(x) for x in (t, *place, *velocity_ned, *std)]
+        values = to_floats(t, *place, *velocity_ned, *std)
         fix = {name: np.array([x]) for name, x in zip(("t", *POSITION, *VELOCITY, *STD), values)}
         fix["quality"] = np.array([int(quality) if quality in GNSS_QUALITIES else 0])
     except (TypeError, ValueError, OverflowError):

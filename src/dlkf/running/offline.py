@@ -60,6 +60,11 @@ class UsableFixes:
         """Of a drive of a dataset."""
         gnss = read_table(folder, "gnss", drive)
         assert gnss is not None  # read_table raises where there is none
+        return UsableFixes.among(gnss)
+
+    @staticmethod
+    def among(gnss: dict[str, np.ndarray]) -> UsableFixes:
+        """Of a drive's table of fixes."""
         usable = usable_fixes(gnss)
         return UsableFixes(*(gnss[c][usable] for c in ("t", "lat_deg", "lon_deg", "quality")))
 

@@ -8,7 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from dlkf.base.classes import find_class
+from dlkf.base.documents import read_yaml
 from dlkf.base.errors import InputError, did_you_mean
+from dlkf.base.own_code import find_missing_modules
 from dlkf.filters.build import OWN_SOURCE, build_filter, describe_filters, filter_names, is_filter
 from dlkf.filters.integration import Estimator
 from dlkf.filters.saved import CONFIG, WEIGHTS, load_filter
@@ -34,7 +36,8 @@ def resolve_model(
     one's own, ``module:Class``.
 
     ``imu`` and ``tuning`` belong to the model-based filters, ``imu`` to ``plus_imu`` as well, ``prior`` to those with
-    ``_prior``. Raises InputError for anything else, listing what is known.
+    ``_prior``. A network of one's own that is not on the path comes from the code logged with it. Raises InputError for
+    anything else, listing what is known.
     """
     if not spec.strip():
         raise InputError("model= is empty; give a name such as plus, or a folder")
@@ -49,7 +52,9 @@ def resolve_model(
     if is_tracked(spec):
         from dlkf.tracking.registry import download_model  # MLflow takes seconds to import
 
-        return load_filter(download_model(spec, tracking_uri))
+        folder = download_model(spec, tracking_uri)
+        find_missing_modules(read_yaml(folder / CONFIG), folder.parents[1] / "code")
+        return load_filter(folder)
     folder = Path(spec).expanduser()
     if folder.is_dir():
         return load_filter(folder)

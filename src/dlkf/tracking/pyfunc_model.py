@@ -19,7 +19,7 @@ from mlflow.pyfunc.model import PythonModel
 
 
 class NavigationFilter(PythonModel):
-    """Navigates whole drives with the trained filter, from IMU and GNSS alone."""
+    """Navigates whole drives with the trained filter, as ``dlkf navigate`` does."""
 
     def load_context(self, context) -> None:
         """Read ``weights.safetensors`` and ``config.yaml``."""
@@ -30,37 +30,49 @@ class NavigationFilter(PythonModel):
     def predict(self, context, model_input: pd.DataFrame, params: dict[str, Any] | None = None) -> pd.DataFrame:
         """A table of drives, or of dataset folders, to solutions: ``drive``, then the columns of ``solution.parquet``.
 
-        With folders ``dataset`` comes first. ``params``: ``lever_arm_x_m``, ``_y_m``, ``_z_m``, from the IMU to the
-        antenna (Forward-Right-Down). Raises InputError for data that cannot be used, and where no drive can be aligned.
+        With folders ``dataset`` comes first, and a filter with vehicle constraints takes their wheel speed, heading and
+        barometer. ``params``: ``lever_arm_x_m``, ``_y_m``, ``_z_m``, from the IMU to the antenna (Forward-Right-Down).
+        Raises InputError for data that cannot be used, and where no drive can be aligned.
         """
+        from dlkf.data.alignment import read_align
         from dlkf.running.offline import navigate_drives
 
-        tables = []
-        for folder, drives in self._load_drives(model_input, params or {}):
-            for result in navigate_drives(drives, self.filter, skipped={}):
+        tables, align = [], read_align()
+        for folder, drives, estimator in self._load_drives(model_input, params or {}):
+            for result in navigate_drives(drives, estimator, align=align, skipped={}):
                 result.table.insert(0, "drive", result.drive)
                 if folder:
                     result.table.insert(0, "dataset", folder)
                 tables.append(result.table)
         return pd.concat(tables, ignore_index=True)
 
-    def _load_drives(self, given: pd.DataFrame, params: dict[str, Any]) -> Iterator[tuple[str, list]]:
+    def _load_drives(self, given: pd.DataFrame, params: dict[str, Any]) -> Iterator[tuple[str, list, Any]]:
+        """A folder, its drives, and the filter with the sensors that they have; of a table no folder."""
         import torch
 
         from dlkf.data.rows import split_drives
-        from dlkf.data.store import drive_from_tables, load_dataset
-        from dlkf.filters.saved import choose_grid
+        from dlkf.data.store import choose_aids, drive_from_tables, drive_rows, load_dataset
+        from dlkf.filters.aids.attach import find_tables, with_aids
+        from dlkf.running.offline import UsableFixes
 
-        grid = choose_grid([self.filter])
-        rate_hz, epoch_s = grid["rate_hz"], grid["epoch_s"]
         if "dataset" in given and given["dataset"].notna().any():
             for folder in given["dataset"].dropna().explode():  # MLflow puts a list of words into one cell
-                options: dict[str, Any] = {"rate_hz": rate_hz, "epoch_s": epoch_s, "reference": False}
-                yield folder, load_dataset(folder, dtype=torch.float64, **options)
+                grid = self._choose_grid([UsableFixes.of(folder, row.name) for row in drive_rows(folder)])
+                estimator = with_aids(self.filter, choose_aids(folder, None))
+                options = {**grid, "reference": False, "aids": find_tables(estimator)}
+                yield folder, load_dataset(folder, dtype=torch.float64, **options), estimator
             return
         arm = [float(params.get(f"lever_arm_{a}_m", 0.0)) for a in "xyz"]
-        tables = split_drives(given, arm)
-        yield "", [drive_from_tables(t, "", rate_hz, epoch_s, torch.float64) for t in tables]
+        tables = list(split_drives(given, arm))
+        grid = self._choose_grid([UsableFixes.among(t.gnss) for t in tables])
+        yield "", [drive_from_tables(t, "", **grid, dtype=torch.float64) for t in tables], self.filter
+
+    def _choose_grid(self, fixes: list) -> dict[str, Any]:
+        """As ``dlkf navigate`` does where nothing is set."""
+        from dlkf.filters.saved import choose_grid
+        from dlkf.running.offline import choose_epoch
+
+        return choose_grid([self.filter], usual_epoch_s=choose_epoch(fixes, 50.0, self.filter))
 
 
 set_model(NavigationFilter())

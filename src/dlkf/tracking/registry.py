@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import dlkf
+from dlkf.base.config import config_dir
 from dlkf.base.documents import read_yaml
 from dlkf.base.errors import InputError, first_line
 from dlkf.base.own_code import copy_modules, find_own_modules
@@ -66,7 +67,7 @@ def log_model(
     check_registration(register, alias)
     own = find_own_modules(read_yaml(Path(folder) / CONFIG))
     with _without_bytecode(), tempfile.TemporaryDirectory() as beside:
-        code = [Path(dlkf.__file__).parent, *copy_modules(own, Path(beside))]
+        code = [_copy_package(Path(beside)), *copy_modules(own, Path(beside, "own"))]
         info = mlflow.pyfunc.log_model(
             name=NAME,
             python_model=str(CODE),
@@ -81,6 +82,15 @@ def log_model(
     if register:
         register_model(client, run.id, register, alias)
     return info.model_uri
+
+
+def _copy_package(folder: Path) -> Path:
+    """This package with ``conf/`` in it, as a wheel has it."""
+    package = folder / "dlkf"
+    shutil.copytree(Path(dlkf.__file__).parent, package, ignore=shutil.ignore_patterns("__pycache__"))
+    if not (package / "conf").is_dir():
+        shutil.copytree(config_dir(), package / "conf")
+    return package
 
 
 @contextmanager
