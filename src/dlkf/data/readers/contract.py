@@ -105,7 +105,9 @@ def velocities(mapped: Mapped, position: Mapping[str, np.ndarray]) -> dict[str, 
     v = mapped.vector("velocity", (2, 3), nan=True)
     frame = mapped.option("velocity", "frame", "ned", "enu", "course", "ecef")
     speed = mapped.scale("velocity", units.SPEED)
-    third = v[:, 2] * speed if v.shape[1] == 3 else np.full(len(v), np.nan)
+    own = mapped.spec["velocity"].get("climb_unit") is not None
+    climb = mapped.scale("velocity", units.SPEED, "climb_unit") if own else speed
+    third = v[:, 2] * climb if v.shape[1] == 3 else np.full(len(v), np.nan)
     if frame == "course":  # speed over ground, course over ground [deg], climb
         v = np.where(v[:, :1] < 0, np.nan, v)  # a phone's −1 for an unknown speed
         course = v[:, 1] * units.DEG

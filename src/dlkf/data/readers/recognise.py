@@ -301,8 +301,14 @@ def _velocity(found: dict[str, str | None]) -> Spec | None:
         if third is None or found["down"]:
             return {"columns": [north, east, *([third] if third else [])], "frame": "ned"}
         return {"columns": [east, north, third], "frame": "enu"}
-    both = [found["speed"], found["course"]]
-    return {"columns": [*both, *([found["up"]] if found["up"] else [])], "frame": "course"} if all(both) else None
+    if not found["speed"] or not found["course"]:
+        return None
+    spec: Spec = {"columns": [found["speed"], found["course"]], "frame": "course"}
+    if (climb := found["up"]) is not None:
+        spec["columns"].append(climb)
+        stated = vocabulary.find_unit(climb)
+        spec["climb_unit"] = stated if stated in units.SPEED else "auto"
+    return spec
 
 
 def _accuracies(frame: pd.DataFrame, found: dict[str, str | None], raw: bool) -> Spec:
