@@ -111,6 +111,8 @@ class AutoReader:
                 self._refuse_absent(within, kind, folder, only)
                 specs[kind] = {"file": None}
                 continue
+            if kind == "gnss" and chosen.refusal:
+                raise InputError(f"{chosen.path}: {chosen.refusal}")
             specs[kind] = merge_settings(chosen.specs[kind], self.known[kind])
             file = specs[kind].get("file")
             there = chosen.name if chosen.table else ", ".join(file) if isinstance(file, list) else file or chosen.name

@@ -11,7 +11,8 @@ import unicodedata
 from collections.abc import Iterable, Sequence
 from itertools import chain
 
-RECEIVER = r"(?:(?:gps|gnss|loc(?:ation)?|rtk|ublox|nmea|receiver|nav|fix) )?"
+RECEIVERS = r"gps|gnss|loc(?:ation)?|rtk|ublox|nmea|receiver|nav|fix"
+RECEIVER = rf"(?:(?:{RECEIVERS}) )?"
 NORTH, EAST = r"n(?:orth|ord)?|lat(?:itude)?|norte?", r"e(?:ast)?|lon(?:gitude)?|ost|est|este"
 DOWN, UP = r"d(?:own)?", r"u(?:p)?|alt(?:itude)?|h(?:eight)?"
 ACCURACY = r"(?:acc(?:uracy)?|error|err|std|sigma|genauigkeit|fehler|precision|exactitud|incertitude|精度|误差|誤差)"
@@ -35,14 +36,17 @@ AXES = {
     for axis in (*"xyz012", *ANGLES)
 }
 
+ELLIPSOIDAL = [r"ell?ip\w*(?: (?:height|alt(?:itude)?|hoe?he))?|h ell|(?:alt(?:itude)?|height) wgs ?84"]
+ELLIPSOIDAL += [r"(?:(?:h(?:eight)?|hgt|alt(?:itude)?) ?)?hae"]
+ELLIPSOIDAL += [r"(?:height|alt(?:itud|itude|ura)?|hauteur|elevacion|hoe?he) ell?\w*|大地高|椭球高|橢球高|楕円体高"]
+SEA_LEVEL = r"(?:h|height|alt(?:itude)?|ele\w*) ?(?:msl|amsl|asl)|h ?msl"
 QUANTITIES: dict[str, list[str]] = {
     "lat": [r"lat(?:itude?)?", r"(?:geo\w* )?breite(?:ngrad)?", r"latitud|phi|纬度|緯度|北纬|北緯"],
     "lon": [r"lon(?:gitude?)?|lng|long", r"(?:geo\w* )?la?enge|(?:geo\w* )?lange|(?:laengen|langen)grad"]
     + [r"longitud|lambda|lam|经度|經度|経度|东经|東経"],
-    "height": [r"ell?ip\w*(?: (?:height|alt(?:itude)?|hoe?he))?|h ell|(?:alt(?:itude)?|height) wgs ?84"]
-    + [r"(?:height|alt(?:itud|itude|ura)?|hauteur|elevacion|hoe?he) ell?\w*|大地高|椭球高|橢球高|楕円体高"]
+    "height": [*ELLIPSOIDAL]
     + [r"h|hgt|height|alt(?:itude)?|ele(?:v|vation)?|hoe?he(?: (?:uber|ueber) .*)?|hauteur|altitud|altura|elevacion"]
-    + [r"高度|高程|海拔(?:高度)?|标高|標高|高さ", r"(?:h|height|alt(?:itude)?|ele\w*) ?(?:msl|amsl|asl)|h ?msl"],
+    + [r"高度|高程|海拔(?:高度)?|标高|標高|高さ", SEA_LEVEL],
     "geoid": [r"geoid(?: ?sep\w*| ?height| ?undulation)?|undulation|sep|geoidundulation|ondulation"]
     + [r"高程异常|ジオイド高?"],
     "north": [rf"(?:{VELOCITY}) ?(?:n(?:orth|ord)?|norte)|north(?:ward)? ?vel(?:ocity)?|北向速度|北向き速度"],
@@ -179,6 +183,24 @@ def find_column(names: Iterable[str], key: str) -> str | None:
             if re.fullmatch(rf"{RECEIVER}(?:{pattern})", said):
                 return name
     return None
+
+
+def find_receiver(name: str) -> str:
+    """The receiver that a name begins with (``rtk`` of ``rtk_lat``) or has in brackets; empty where it has none."""
+    if begins := re.match(rf"({RECEIVERS}) \w", words(name)):
+        return begins[1]
+    in_brackets = re.search(r"[\[(](gps|gnss)[\])]", name, re.IGNORECASE)
+    return in_brackets[1].lower() if in_brackets else ""
+
+
+def is_ellipsoidal(name: str) -> bool:
+    """Whether a height's name says that it is above the ellipsoid."""
+    return any(re.fullmatch(f"{RECEIVER}(?:{pattern})", words(name)) for pattern in ELLIPSOIDAL)
+
+
+def is_wheel(name: str) -> bool:
+    """Whether a name says that a speed is that of a wheel or of the car's bus, and of no receiver."""
+    return not find_receiver(name) and has(re.sub(r"[()\[\]]", " ", name), WHEEL)
 
 
 def match_columns(names: Iterable[str], pattern: str) -> list[str]:
