@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 
 from dlkf.base.errors import InputError
+from dlkf.base.settings import is_number
 from dlkf.data.dead_sensors import check_dead_axes
 from dlkf.data.discovery.findings import Finding, Sure, discover, find_accel_unit, find_value
 from dlkf.data.discovery.motion import find_motion
@@ -41,6 +42,7 @@ USUAL = {
 MOSTLY = 0.8  # of the fixes
 FEWEST_FIXES = 3  # below, no finding has a spread
 HIGHEST_M = 9000.0  # of a road
+SURE_SCALE = 0.05  # 1σ of a unit by number that may be given so
 METRIC = ("m/s", "cm/s", "mm/s")
 LEAST_GRAVITY = 0.5  # of the mean force: the length of the mean; with gravity in it nearly 1
 
@@ -220,7 +222,8 @@ def _refuse_doubt(found: list[Finding], wanted: set[str], where: str, t: Mapping
 def _describe_by_hand(doubts: list[Finding], wanted: set[str], t: Mapping[str, np.ndarray]) -> str:
     """The settings of everything in doubt, with their usual values and when these are right."""
     said = []
-    for setting in (doubt.setting for doubt in doubts):
+    for doubt in doubts:
+        setting = doubt.setting
         if setting.endswith("offset_s"):
             within = (t["gnss"] >= t["imu"][0]) & (t["gnss"] <= t["imu"][-1])
             overlap = np.mean(within) > MOSTLY
@@ -229,6 +232,8 @@ def _describe_by_hand(doubts: list[Finding], wanted: set[str], t: Mapping[str, n
         elif setting == "imu.axes":
             names = sorted(wanted & AXES)
             said.append(f"{' '.join(f'reader.{name}=frd' for name in names)} (if x is forward, y right, z down)")
+        elif is_number(doubt.value) and not doubt.std > SURE_SCALE * doubt.value:
+            said.append(f"reader.{setting}={doubt.value}")  # counts, or g of a scale of its own
         else:
             said.append(f"reader.{setting}={USUAL.get(setting, '…')}")
     return " ".join(said)
