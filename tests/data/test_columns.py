@@ -166,7 +166,7 @@ def test_accuracies_and_dilutions():
     assert found["std_position"] == {"columns": ["h_acc [mm]"], "unit": "mm"}
     found = gnss_spec(fixes(hAcc=1200.0)).spec
     assert found["std_position"]["unit"] == "mm"
-    found, notes = gnss_spec(fixes(hdop=0.7, quality=2))
+    found, notes, _ = gnss_spec(fixes(hdop=0.7, quality=2))
     assert found["std_position"] == {"columns": ["hdop", "hdop"], "unit": 1.0}
     assert any("1 m times hdop" in note for note in notes)
     assert gnss_spec(fixes(hdop=0.7, fix="RTK fixed")).spec["std_position"]["unit"] == 0.02  # a quality in words

@@ -13,6 +13,7 @@ from dlkf.data.readers.frames import DriveFrames
 from dlkf.data.readers.qualities import quality_spec
 from dlkf.data.schema import ACCEL, GYRO
 from tests.data.logs.clock import DEG, GPS, TOW, UNIX, WEEK, G
+from tests.data.logs.phones import phyphox, phyphox_android
 
 Tables = dict[str, pd.DataFrame]
 
@@ -168,7 +169,8 @@ def test_xsens_export(tmp_path: Path, drive: Tables) -> None:
     (tmp_path / "MT.txt").write_text("// MT Manager\n//  Update Rate: 100Hz\n" + table.to_csv(index=False, sep="\t"))
     (got,) = AutoReader().read(tmp_path)
     assert len(got.imu) == len(imu) and len(got.gnss) == len(gnss) - 1
-    assert "not used: PacketCounter" in "\n".join(got.notes)
+    notes = "\n".join(got.notes)
+    assert "not used: PacketCounter" in notes and "stamps of" not in notes  # a counter is no time of week
 
 
 def test_velocities_under_names_of_their_own(tmp_path: Path, drive: Tables) -> None:
@@ -230,3 +232,77 @@ def test_fixes_without_a_header(order: str, tmp_path: Path, drive: Tables) -> No
     np.testing.assert_allclose(got.gnss.lat_deg, gnss.lat_deg, atol=2e-7)
     np.testing.assert_allclose(got.gnss.vel_n, gnss.vel_n, atol=3e-3)
     np.testing.assert_allclose(got.imu.accel_x, imu.accel_x, atol=0.02)
+
+
+def sbg(gnss: pd.DataFrame) -> pd.DataFrame:
+    """Names of an export by sbgInsCenter, heights above sea level."""
+    place = {"Latitude": gnss.lat_deg, "Longitude": gnss.lon_deg, "Altitude": gnss.height_m - 45, "Undulation": 45.0}
+    stds = {"Latitude Accuracy": 0.02, "Longitude Accuracy": 0.03, "Altitude Accuracy": 0.04}
+    velocity = {"Velocity North": gnss.vel_n, "Velocity East": gnss.vel_e, "Velocity Down": gnss.vel_d}
+    return pd.DataFrame({"t": gnss.t, **place, "Position Type": "RTK_INT", **stds, **velocity})
+
+
+def vectornav(gnss: pd.DataFrame) -> pd.DataFrame:
+    place = {"PosLlaLat": gnss.lat_deg, "PosLlaLon": gnss.lon_deg, "PosLlaAlt": gnss.height_m}
+    return pd.DataFrame({"t": gnss.t, **place, "VelNedN": gnss.vel_n, "VelNedE": gnss.vel_e, "VelNedD": gnss.vel_d})
+
+
+def oxts(gnss: pd.DataFrame) -> pd.DataFrame:
+    place = {"PosLat (deg)": gnss.lat_deg, "PosLon (deg)": gnss.lon_deg, "PosAlt (m)": gnss.height_m}
+    velocity = {"VelNorth (m/s)": gnss.vel_n, "VelEast (m/s)": gnss.vel_e, "VelDown (m/s)": gnss.vel_d}
+    return pd.DataFrame({"t": gnss.t, **place, **velocity})
+
+
+@pytest.mark.parametrize("table", [sbg, vectornav, oxts])
+def test_names_of_inertial_systems(table, tmp_path: Path, drive: Tables) -> None:
+    """Every column is used; of SBG quality and accuracies too."""
+    box(drive["imu"], gyro="AngleRate{} (deg/s)").to_csv(tmp_path / "a.csv", index=False)
+    table(drive["gnss"]).to_csv(tmp_path / "b.csv", index=False)
+    got, notes = read(tmp_path, drive)
+    np.testing.assert_allclose(got.gnss.vel_d, drive["gnss"].vel_d, atol=1e-6)
+    assert "not used" not in notes
+    if table is sbg:
+        assert set(got.gnss.quality) == {4}
+        stds = got.gnss[["std_pos_n", "std_pos_e", "std_pos_d"]]
+        np.testing.assert_allclose(stds, np.broadcast_to([0.02, 0.03, 0.04], stds.shape))
+
+
+def test_rates_in_millidegrees(tmp_path: Path, drive: Tables) -> None:
+    imu = drive["imu"]
+    table = box(imu, "acc_{}_mg", "gyro_{}_mdps")
+    table.iloc[:, 1:] *= 1000
+    table.to_csv(tmp_path / "a.csv", index=False)
+    fixes(drive["gnss"], ENGLISH, t=drive["gnss"].t).to_csv(tmp_path / "b.csv", index=False)
+    read(tmp_path, drive)
+
+
+def test_the_unit_of_rates_without_fixes_is_that_of_their_names(tmp_path: Path, drive: Tables) -> None:
+    box(drive["imu"], "acc_{} (g)", "gyr_{} (deg/s)").to_csv(tmp_path / "a.csv", index=False)
+    (got,) = AutoReader().read(tmp_path)
+    np.testing.assert_allclose(got.imu[list(GYRO)], drive["imu"][list(GYRO)], atol=1e-9)
+
+
+def test_milliseconds_behind_a_colon(tmp_path: Path, drive: Tables) -> None:
+    """AndroSensor: dates such as 2025-01-22 23:57:12:010."""
+    for kind, name in (("imu", "a"), ("gnss", "b")):
+        when = pd.to_datetime(UNIX + drive[kind].t, unit="s").dt.strftime("%Y-%m-%d %H:%M:%S:%f").str[:-3]
+        stamps = {"YYYY-MO-DD HH-MI-SS_SSS": when}
+        table = box(drive[kind], **stamps) if kind == "imu" else fixes(drive[kind], ENGLISH, **stamps)
+        table.to_csv(tmp_path / f"{name}.csv", index=False)
+    got, _ = read(tmp_path, drive)
+    np.testing.assert_allclose(got.gnss.t, drive["gnss"].t, atol=2e-3)
+    assert abs(got.meta["gps_zero_s"] - GPS) < 1.0
+
+
+def test_time_since_the_start(tmp_path: Path, drive: Tables) -> None:
+    box(drive["imu"], **{"Time since start in ms": np.round(1000 * drive["imu"].t)}).to_csv(tmp_path / "a.csv")
+    fixes(drive["gnss"], ENGLISH, t=drive["gnss"].t).to_csv(tmp_path / "b.csv", index=False)
+    read(tmp_path, drive)
+
+
+@pytest.mark.parametrize("app", [phyphox, phyphox_android])
+def test_a_phones_export_with_decimal_commas(app, tmp_path: Path, drive: Tables) -> None:
+    app(tmp_path, drive)
+    for path in tmp_path.glob("*.csv"):
+        pd.read_csv(path).to_csv(path, index=False, sep=";", decimal=",", quoting=1)
+    read(tmp_path, drive)

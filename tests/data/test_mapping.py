@@ -106,6 +106,14 @@ def test_degrees_and_minutes_with_hemispheres(tmp_path, tables):
     drive = read(tmp_path, tables, gnss__position__unit="ddmm", gnss__position__hemispheres=["ns", "ew"])
     assert metres(drive.gnss, gnss).max() < 1e-4
     np.testing.assert_allclose(degrees_minutes(np.array([4807.038, -1131.0])), [48.1173, -11.516666666667])
+    with pytest.raises(
+        InputError, match=r"line 2: column 'lat_deg' is .*, which has more than 60 minutes and is no ddmm"
+    ):
+        only = {name: 60 * (gnss[name].abs() + more) for name, more in (("lat_deg", 1.0), ("lon_deg", 0.0))}
+        gnss.assign(**only).to_csv(tmp_path / "gnss.csv", index=False)
+        read(tmp_path, tables, gnss__position__unit="ddmm")
+    drive = read(tmp_path, tables, gnss__position__unit=0.016666666666667)  # as the line says
+    np.testing.assert_allclose(drive.gnss.lat_deg, gnss.lat_deg.abs() + 1.0, atol=1e-9)
     gnss.assign(**minutes, ns="Q", ew="E").to_csv(tmp_path / "gnss.csv", index=False)
     with pytest.raises(InputError, match=r"line 2: column 'ns' is 'Q', must be N or S"):
         read(tmp_path, tables, gnss__position__unit="ddmm", gnss__position__hemispheres=["ns", "ew"])

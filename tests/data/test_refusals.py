@@ -377,3 +377,20 @@ def test_a_reader_with_settings_left_open_shares_them_too(tmp_path):
     count = ingest(LogReader(imu, PLAIN["gnss"]), logs, tmp_path / "out", IngestOptions(), parallel=None,
                    progress=lambda one, _: notes.extend(one.notes))  # fmt: skip
     assert count == 2 and any("short: not sure by itself" in n for n in notes)
+
+
+def test_counts_are_refused_with_the_scales_to_give(tmp_path, drive):
+    """A sensor's raw numbers: the line gives both scales, which read the log."""
+    imu = drive["imu"].copy()
+    imu[list(ACCEL)] = (imu[list(ACCEL)] / 9.80665 * 16384).round()
+    imu[list(GYRO)] = (np.degrees(imu[list(GYRO)]) * 131).round()
+    imu.to_csv(tmp_path / "imu.csv", index=False)
+    drive["gnss"].to_csv(tmp_path / "gnss.csv", index=False)
+    with pytest.raises(InputError) as refused:
+        list(AutoReader().read(tmp_path))
+    found = re.search(r"give reader.imu.accel.unit=(\S+) reader.imu.gyro.unit=([^\s,]+)", str(refused.value))
+    accel, gyro = map(float, found.groups())
+    (got,) = AutoReader({"accel": {"unit": accel}, "gyro": {"unit": gyro}}).read(tmp_path)
+    # the median force of these turns is above gravity by 1.7 %
+    np.testing.assert_allclose(got.imu[list(ACCEL)], drive["imu"][list(ACCEL)], atol=0.2)
+    np.testing.assert_allclose(got.imu[list(GYRO)], drive["imu"][list(GYRO)], atol=0.01)

@@ -21,13 +21,12 @@ import pymap3d
 from numpy.typing import NDArray
 
 from dlkf.base.errors import InputError
-from dlkf.data.readers.units import GPS_EPOCH_UNIX, WEEK_S, clock_by_size, gps_seconds, leap_seconds
+from dlkf.data.readers.units import GPS_EPOCH_UNIX, SPEED, WEEK_S, clock_by_size, gps_seconds, leap_seconds
 from dlkf.data.resampling import ON_BOUNDARY_S
 from dlkf.data.tables import DriveClock
 from dlkf.running.bag_exports import write_bag
 
 Times = list[datetime] | None
-KNOTS = 1852 / 3600  # m/s
 DEAD_RECKONING = 6  # NMEA GGA quality
 GGA = {9: 2}  # quality as the standard has it, which counts SBAS as differential
 RMC = {1: "A", 2: "D", 3: "P", 4: "R", 5: "F", 6: "E", 9: "D"}  # mode of a quality
@@ -129,7 +128,7 @@ def write_nmea(path: Path, table: pd.DataFrame, when: Times, name: str, quality:
     start = datetime(1980, 1, 6, tzinfo=UTC)
     lines = []
     course = np.degrees(np.arctan2(table["vel_e"].to_numpy(), table["vel_n"].to_numpy())) % 360
-    speed = _speed(table) / KNOTS
+    speed = _speed(table) / SPEED["knots"]
     rows: Iterator[Any] = iter(table.itertuples())
     for k, row in enumerate(rows):
         at = when[k] if when is not None else start + timedelta(seconds=float(row.t))

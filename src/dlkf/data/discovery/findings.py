@@ -159,7 +159,7 @@ def _gyro_unit(gyro: Floats, pose: Pose | None, increments: bool) -> Finding:
         if unit is not None:
             detail += f"; no other is near, or gives it the vibration of cars ({shaking * RATE[unit]:.2g} rad/s)"
     counted = unit is None and increments and std < 0.01 * scale
-    return Finding(setting, unit or float(f"{scale:.6g}"), unit is not None or counted, detail)
+    return Finding(setting, unit or float(f"{scale:.6g}"), unit is not None or counted, detail, std=std)
 
 
 def _drift(pose: Pose | None, wanted: set[str], sure: Sure, reach_s: float) -> list[Finding]:

@@ -9,7 +9,7 @@ from typing import Any
 
 from dlkf.base.config import merge_settings, read_preset
 from dlkf.base.errors import InputError
-from dlkf.data.readers import formats, recognise
+from dlkf.data.readers import formats, recognise, units, vocabulary
 from dlkf.data.readers.archives import drive_name, drive_places, is_archive, unpack
 from dlkf.data.readers.formats import rosbag
 from dlkf.data.readers.frames import DriveFrames, Place
@@ -111,6 +111,8 @@ class AutoReader:
                 self._refuse_absent(within, kind, folder, only)
                 specs[kind] = {"file": None}
                 continue
+            if kind == "gnss" and chosen.refusal:
+                raise InputError(f"{chosen.path}: {chosen.refusal}")
             specs[kind] = merge_settings(chosen.specs[kind], self.known[kind])
             file = specs[kind].get("file")
             there = chosen.name if chosen.table else ", ".join(file) if isinstance(file, list) else file or chosen.name
@@ -199,11 +201,13 @@ def _recognise_files(folder: Path, known: Known) -> list[Contents]:
     """What the files of a folder hold; of one whose files are known by their names, that."""
     for name, files in LAYOUTS.items():
         if all((folder / file).is_file() for file in files) and _has_its_columns(folder / files[0], name):
-            base = read_preset("reader", name)
-            specs = leave_open({kind: base[kind] for kind in ("imu", "gnss")})
+            base, first = read_preset("reader", name), folder / files[0]
+            options = text_options(first) if first.suffix == ".csv" else {}
+            marks = {"text": {key: options[key] for key in ("separator", "decimal") if key in options}}
+            specs = leave_open({kind: {**base[kind], **marks} for kind in ("imu", "gnss")})
             if (beside := BAROMETERS.get(name)) and (folder / beside).is_file():  # by the clock of the IMU
-                specs["baro"] = {**base["baro"], "file": beside}
-            return [Contents(folder / files[0], [Offer(folder / files[0], f"layout of {name}", specs)])]
+                specs["baro"] = {**base["baro"], **marks, "file": beside}
+            return [Contents(first, [Offer(first, f"layout of {name}", specs)])]
     return [recognise_file(p, known) for p in sorted(folder.iterdir()) if p.is_file() and not p.name.startswith(".")]
 
 
@@ -256,7 +260,9 @@ def _settle_at_rest(imu: dict[str, Any]) -> list[str]:
     """Settle what cannot be estimated without fixes, and report it."""
     detail = []
     for key in ("accel", "gyro"):
-        taken = {"unit": "auto" if key == "accel" else "rad/s", "axes": "frd"}
+        stated = vocabulary.find_unit(str(imu[key]["columns"][0]))
+        rate = stated if stated in units.RATE else "rad/s"
+        taken = {"unit": "auto" if key == "accel" else rate, "axes": "frd"}
         unsaid = {name: value for name, value in taken.items() if imu[key][name] == "auto"}
         imu[key] |= unsaid
         left = [f"reader.imu.{key}.{name}={value}" for name, value in unsaid.items() if value != "auto"]

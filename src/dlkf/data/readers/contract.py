@@ -105,7 +105,9 @@ def velocities(mapped: Mapped, position: Mapping[str, np.ndarray]) -> dict[str, 
     v = mapped.vector("velocity", (2, 3), nan=True)
     frame = mapped.option("velocity", "frame", "ned", "enu", "course", "ecef")
     speed = mapped.scale("velocity", units.SPEED)
-    third = v[:, 2] * speed if v.shape[1] == 3 else np.full(len(v), np.nan)
+    own = mapped.spec["velocity"].get("climb_unit") is not None
+    climb = mapped.scale("velocity", units.SPEED, "climb_unit") if own else speed
+    third = v[:, 2] * climb if v.shape[1] == 3 else np.full(len(v), np.nan)
     if frame == "course":  # speed over ground, course over ground [deg], climb
         v = np.where(v[:, :1] < 0, np.nan, v)  # a phone's −1 for an unknown speed
         course = v[:, 1] * units.DEG
@@ -124,13 +126,18 @@ def _latitudes(mapped: Mapped, minutes: bool) -> tuple[np.ndarray, np.ndarray, n
     """Latitude, longitude, height in the file's units, signs from the hemispheres' columns."""
     spec = mapped.spec["position"]
     llh = mapped.vector("position", (3,), nan=True)
+    part = mapped.find_part("position")
+    if minutes and len(bad := np.argwhere(np.abs(llh[:, :2]) % 100 > 60)):
+        row, k = map(int, bad[0])
+        remedy = f"of minutes alone set reader.{mapped.kind}.position.unit=0.016666666666667"
+        what = f"is {llh[row, k]:.10g}, which has more than 60 minutes and is no ddmm.mmmm; {remedy}"
+        part.fail(row, spec["columns"][k], what)
     angles = units.degrees_minutes(llh[:, :2]) if minutes else llh[:, :2].copy()
     sides = spec.get("hemispheres")
     if sides is None:
         return angles[:, 0], angles[:, 1], llh[:, 2]
     if isinstance(sides, str) or len(sides) != 2:
         raise InputError(f"reader.{mapped.kind}.position.hemispheres={sides}: must be two columns, of N/S and of E/W")
-    part = mapped.find_part("position")
     for k, (name, letters) in enumerate(zip(sides, ("NS", "EW"))):
         texts = part.texts(name).str.upper().to_numpy()
         known = np.isin(texts, list(letters)) | ~np.isfinite(angles[:, k])

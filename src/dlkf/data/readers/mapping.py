@@ -32,7 +32,7 @@ ENTRIES = {
     "accel": ("columns", "unit", "axes", "mirror"),
     "gyro": ("columns", "unit", "axes", "mirror"),
     "position": ("columns", "unit", "height_unit", "frame", "geoid", "hemispheres", "zero", "delay_s"),
-    "velocity": ("columns", "unit", "frame"),
+    "velocity": ("columns", "unit", "climb_unit", "frame"),
     "std_position": ("columns", "unit", "frame"),
     "std_velocity": ("columns", "unit", "frame"),
     "quality": ("column", "map", "default"),

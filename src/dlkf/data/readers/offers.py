@@ -40,13 +40,14 @@ NAVEGO = {"imu": "fb_0", "gnss": "stdm_0"}  # a column of each of NaveGo's struc
 @dataclass(frozen=True)
 class Offer:
     """What a file, or a table in it, can give: ``specs`` of a mapping by kind, imu, gnss, speed, heading, baro, and
-    accel or gyro where that sensor stands alone."""
+    accel or gyro where that sensor stands alone; ``refusal`` says why its fixes cannot be used as they are."""
 
     path: Path
     detail: str
     specs: dict[str, dict[str, Any]] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     table: str | None = None
+    refusal: str = ""
 
     @property
     def name(self) -> str:
@@ -168,7 +169,8 @@ def _offer_table(
     source: dict[str, Any] = {"format": name, "file": path.name, "text": options}
     source |= {"table": part} if part is not None else {}
     time = next((one.spec["time"] for one in (imu, gnss) if one is not None), None)
-    aids = recognise.aid_specs(table, part or path.stem, time)
+    taken = [str(c) for one in (imu, gnss) if one is not None for c in _columns(one.spec)]
+    aids = recognise.aid_specs(table, part or path.stem, time, taken)
     found = {kind: one for kind, one in (("imu", imu), ("gnss", gnss)) if one is not None}
     if not found and not aids:
         aids = recognise.sensor_spec(table, part or path.stem)
@@ -179,7 +181,8 @@ def _offer_table(
     columns = ", ".join(dict.fromkeys(str(c) for spec in (specs or aids).values() for c in _columns(spec)))
     notes = tuple(note for one in found.values() for note in one.notes)
     specs = leave_open(specs | aids, stated=True)
-    return [Offer(path, f"{name} with {columns}", specs, notes, part)] if specs else []
+    refusal = "" if gnss is None else gnss.refusal
+    return [Offer(path, f"{name} with {columns}", specs, notes, part, refusal)] if specs else []
 
 
 def find_format(path: Path) -> str | None:

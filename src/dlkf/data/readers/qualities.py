@@ -19,11 +19,12 @@ WORDS = {
     + ("无", "无效", "無効"),
     1: ("single", "spp", "sps", "autonomous", "standalone", "3d", "3d fix", "2d", "2d fix", "gps", "gps fix", "einzel")
     + ("autonome", "autonomo", "单点", "单点解", "単独", "単独測位"),
-    2: ("dgps", "dgnss", "sbas", "differential", "differentiell", "differentiel", "diferencial")
+    2: ("dgps", "dgnss", "sbas", "differential", "differentiell", "differentiel", "diferencial", "psrdiff")
     + ("差分", "差分解", "ディファレンシャル"),
     4: ("rtk", "rtk fix", "rtk fixed", "fixed", "fix", "rtk int", "int", "integer", "fixe", "fijo", "fest")
-    + ("固定", "固定解", "フィックス"),
-    5: ("float", "rtk float", "flottant", "flotante", "gleitend", "浮点", "浮点解", "浮動", "フロート"),
+    + ("narrow int", "wide int", "l1 int", "固定", "固定解", "フィックス"),
+    5: ("float", "rtk float", "flottant", "flotante", "gleitend", "narrow float", "l1 float")
+    + ("浮点", "浮点解", "浮動", "フロート"),
 }
 # number of a fix: NMEA's GGA code
 READINGS: dict[str, dict[int, int]] = {

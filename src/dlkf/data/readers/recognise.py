@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -16,6 +16,7 @@ from dlkf.data.readers import by_numbers, stamps, units, vocabulary
 from dlkf.data.readers.aids import COUNTS
 from dlkf.data.readers.frames import LogTable
 from dlkf.data.readers.qualities import quality_spec
+from dlkf.data.readers.receivers import choose_receiver, find_geoid, find_velocity
 from dlkf.data.resampling import DEFAULT_STD
 from dlkf.navigation.earth import STANDARD_GRAVITY as G
 
@@ -33,10 +34,11 @@ COARSE = 0.2  # of the samples, with the stamp of the one before: the clock is c
 
 
 class Recognised(NamedTuple):
-    """The mapping of a table, and lines on what was taken for what."""
+    """The mapping of a table, and lines on what was taken for what; ``refusal`` says why it cannot be used as it is."""
 
     spec: Spec
     notes: tuple[str, ...] = ()
+    refusal: str = ""
 
 
 def named_columns(table: LogTable, known: Mapping[str, Any]) -> dict[str, list[str]]:
@@ -103,8 +105,8 @@ def sensor_spec(table: LogTable, called: str) -> dict[str, Spec]:
 def gnss_spec(table: LogTable, named: Mapping[str, list[str]] = NONE_NAMED) -> Recognised | None:
     """The mapping of a table that holds fixes, in the columns ``named`` as an IMU's; None if it does not."""
     frame, names = _select_numeric(table)
-    found = {key: vocabulary.find_column(names, key) for key in vocabulary.QUANTITIES}
-    found |= dict(zip(("lat", "lon", "height"), named.get("position", ())))
+    receiver = choose_receiver(frame, [str(n) for n in table.frame.columns], named.get("position", ()))
+    found = receiver.found
     lat, lon, height = (found[key] for key in ("lat", "lon", "height"))
     if (lat is None or lon is None) and vocabulary.find_triads(names):
         return None
@@ -126,20 +128,24 @@ def gnss_spec(table: LogTable, named: Mapping[str, list[str]] = NONE_NAMED) -> R
     position: Spec = {"columns": [lat, lon, height], "unit": _angle_unit(frame, found)}
     if (unit := vocabulary.find_unit(height)) in units.LENGTH:
         position["height_unit"] = unit
-    if found["geoid"] is not None:
-        position["geoid"] = found["geoid"]
+    more = []
+    if (geoid := find_geoid(frame, receiver)) is not None:
+        position["geoid"] = geoid
+        more = [f"added {geoid} to {height}; reader.gnss.position.geoid=null if that is above the ellipsoid already"]
     if (sides := _hemispheres(table.frame[known])) is not None:
         position["hemispheres"] = sides
-    velocity, more = _velocity(found), []
+    velocity = find_velocity([name for name in receiver.names if name in frame], receiver.called)
     if "velocity" in named:
         velocity = {"columns": named["velocity"], "frame": "ned"}
     elif velocity is None:
         velocity = _velocity_by_numbers(table, frame[known], time, position)
         if columns := velocity["columns"]:
-            more = [f"took {', '.join(columns)} for the velocities by the way between the positions"]
+            more += [f"took {', '.join(columns)} for the velocities by the way between the positions"]
     out: Spec = {"time": time, "position": position, "velocity": velocity}
     out |= _accuracies(frame, found, raw=position["unit"] == "1e-7deg")
-    quality, notes = quality_spec(table.frame[known], _quality_column(table.frame), _accuracy_m(frame, out))
+    quality, notes = quality_spec(
+        table.frame[known], _quality_column(table.frame[receiver.names]), _accuracy_m(frame, out)
+    )
     if quality is not None:
         out["quality"] = quality
     if "std_position" not in out and found["hdop"] is not None:
@@ -149,7 +155,7 @@ def gnss_spec(table: LogTable, named: Mapping[str, list[str]] = NONE_NAMED) -> R
     if held is not None:
         out["rows"] = "changed"
         notes.append(f"took {int(known.sum())} of {len(held)} rows for fixes: the others repeat the position before")
-    return Recognised(out, (*more, *notes))
+    return Recognised(out, (*more, *notes), receiver.refusal)
 
 
 def _velocity_by_numbers(table: LogTable, frame: pd.DataFrame, time: Spec, position: Spec) -> Spec:
@@ -160,7 +166,8 @@ def _velocity_by_numbers(table: LogTable, frame: pd.DataFrame, time: Spec, posit
         return {"columns": None}
     taken = {*position["columns"], *(time["column"] if isinstance(time["column"], list) else [time["column"]])}
     lat, lon = (scale * frame[c].to_numpy(float) for c in position["columns"][:2])
-    return by_numbers.velocities(t, lat, lon, frame[[c for c in frame.columns if str(c) not in taken]])
+    others = [c for c in frame.columns if str(c) not in taken and not vocabulary.is_wheel(str(c))]
+    return by_numbers.velocities(t, lat, lon, frame[others])
 
 
 def _hemispheres(frame: pd.DataFrame) -> list[str] | None:
@@ -180,17 +187,18 @@ def _find_repeated(frame: pd.DataFrame, place: list[str]) -> pd.Series | None:
     return same if same.mean() > 0.5 else None
 
 
-def aid_specs(table: LogTable, called: str, time: Spec | None = None) -> dict[str, Spec]:
+def aid_specs(table: LogTable, called: str, time: Spec | None = None, taken: Collection[str] = ()) -> dict[str, Spec]:
     """The mapping of every aid in a table: wheel speed, heading and barometer by the columns' names, a pressure by its
     size too.
 
     ``called`` is the table's name, ``time`` the mapping of its stamps where an IMU or fixes in it have set it. The
-    speed of a receiver is none of a wheel: it stands beside a latitude, or is called so.
+    speed of a receiver is none of a wheel: it is among the columns ``taken``, stands beside a latitude without a
+    wheel's name, or is called so.
     """
     numbers, names = _select_numeric(table)
     places = vocabulary.find_column(names, "lat") is not None
     found: dict[str, Spec] = {}
-    wheels = vocabulary.wheel_columns(names, "" if places else called)
+    wheels = vocabulary.wheel_columns([n for n in names if n not in taken], "" if places else called)
     if wheels:
         found["speed"] = {"value": _wheel_value(numbers, wheels)}
     headings = [n for n in names if vocabulary.has(n, vocabulary.HEADING)]
@@ -227,7 +235,7 @@ def _wheel_value(numbers: pd.DataFrame, columns: list[str]) -> Spec:
 def velocity_spec(table: LogTable) -> tuple[Spec, Spec] | None:
     """Time and velocities of a table that has these and no positions; None if it does not."""
     _, names = _select_numeric(table)
-    velocity = _velocity({key: vocabulary.find_column(names, key) for key in vocabulary.QUANTITIES})
+    velocity = find_velocity(names)
     if velocity is None:
         return None
     every = pd.Series(True, table.frame.index)
@@ -293,16 +301,6 @@ def _find_stated_unit(frame: pd.DataFrame, columns: list[str]) -> Spec:
     size = float(np.median(np.linalg.norm(frame[columns].dropna().to_numpy(), axis=1)))
     near = size > 0 and abs(np.log(size * units.ACCELERATION[unit] / G)) < NEAR_GRAVITY
     return {"unit": unit} if near and accel_units(size, units.ACCELERATION) != [unit] else {}
-
-
-def _velocity(found: dict[str, str | None]) -> Spec | None:
-    north, east, third = found["north"], found["east"], found["down"] or found["up"]
-    if north and east:
-        if third is None or found["down"]:
-            return {"columns": [north, east, *([third] if third else [])], "frame": "ned"}
-        return {"columns": [east, north, third], "frame": "enu"}
-    both = [found["speed"], found["course"]]
-    return {"columns": [*both, *([found["up"]] if found["up"] else [])], "frame": "course"} if all(both) else None
 
 
 def _accuracies(frame: pd.DataFrame, found: dict[str, str | None], raw: bool) -> Spec:

@@ -12,10 +12,11 @@ import numpy as np
 import pandas as pd
 
 from dlkf.base.errors import InputError
+from dlkf.base.settings import is_number
 from dlkf.data.dead_sensors import check_dead_axes
 from dlkf.data.discovery.findings import Finding, Sure, discover, find_accel_unit, find_value
 from dlkf.data.discovery.motion import find_motion
-from dlkf.data.discovery.units import compare_climbs, nearest_unit, speed_factor
+from dlkf.data.discovery.units import CLIMBS_ALIKE, compare_climbs, nearest_unit, speed_factor
 from dlkf.data.readers import units
 from dlkf.data.readers.contract import gnss_frame, imu_frame, positions
 from dlkf.data.readers.mapping import Mapped
@@ -27,7 +28,8 @@ from dlkf.data.validate import check_time, usable_fixes
 AUTO = "auto"
 AXES = {"imu.accel.axes", "imu.gyro.axes"}
 NEUTRAL: dict[str, Any] = {  # settings that may be auto, and what stands there until they are known
-    **dict.fromkeys(("imu.accel.unit", "imu.gyro.unit", "gnss.velocity.unit", "gnss.position.height_unit"), 1.0),
+    **dict.fromkeys(("imu.accel.unit", "imu.gyro.unit", "gnss.velocity.unit"), 1.0),
+    **dict.fromkeys(("gnss.velocity.climb_unit", "gnss.position.height_unit"), 1.0),
     **dict.fromkeys(AXES, "frd"),
     **dict.fromkeys(("imu.time.offset_s", "gnss.time.offset_s", "gnss.time.drift_ppm", "gnss.position.delay_s"), 0.0),
 }
@@ -40,6 +42,8 @@ USUAL = {
 MOSTLY = 0.8  # of the fixes
 FEWEST_FIXES = 3  # below, no finding has a spread
 HIGHEST_M = 9000.0  # of a road
+SURE_SCALE = 0.05  # 1σ of a unit by number that may be given so
+METRIC = ("m/s", "cm/s", "mm/s")
 LEAST_GRAVITY = 0.5  # of the mean force: the length of the mean; with gravity in it nearly 1
 
 
@@ -102,8 +106,13 @@ def settle(
     if "imu.accel.unit" in wanted:
         _refuse_without_gravity(imu, where)
     gnss = gnss_frame(replace(mapped["gnss"], spec=specs["gnss"]), t["gnss"])
+    metre, climb_known = 1.0, "gnss.velocity.climb_unit" not in wanted
     if "gnss.position.height_unit" in wanted:
-        found.append(_height_unit(gnss))
+        found.append(_height_unit(gnss, climb_known))
+        metre = units.LENGTH[found[-1].value]
+    if not climb_known:
+        found.append(_climb_unit(gnss, metre, specs["gnss"]["velocity"].get("unit")))
+        gnss["vel_d"] *= units.factor(found[-1].value, units.SPEED, "reader.gnss.velocity.climb_unit")
     samples, fixes = _keep_rising(imu), _keep_rising(gnss[usable_fixes(gnss)])
     check_dead_axes(samples, find_motion(fixes), f"{where}, {mapped['imu'].table.path.name}", frd=False)
     found += discover(
@@ -152,10 +161,10 @@ def _speed_unit(gnss: Mapped, t: np.ndarray) -> Finding:
     return finding
 
 
-def _height_unit(gnss: pd.DataFrame) -> Finding:
-    """By the vertical velocity; without one metres, but mm as u-blox has them where no road is as high."""
+def _height_unit(gnss: pd.DataFrame, climb_known: bool) -> Finding:
+    """By a vertical velocity of known unit; without one metres, but mm as u-blox has them where no road is as high."""
     setting, heights = "gnss.position.height_unit", gnss["height_m"].to_numpy()
-    climb = compare_climbs(*(gnss[name].to_numpy() for name in ("t", "height_m", "vel_d")))
+    climb = compare_climbs(*(gnss[name].to_numpy() for name in ("t", "height_m", "vel_d"))) if climb_known else None
     unit = None if climb is None else nearest_unit(1 / climb.slope, climb.std / climb.slope**2, units.LENGTH)
     if unit is not None and climb is not None:
         return Finding(setting, unit, True, f"they change {climb.slope:.3g} ± {climb.std:.1g} times as vel_d says")
@@ -163,6 +172,19 @@ def _height_unit(gnss: pd.DataFrame) -> Finding:
     if size > HIGHEST_M:
         return Finding(setting, "mm", True, f"{size:.0f} in the median, as u-blox has them; no vel_d tells")
     return Finding(setting, "m", True, "no vel_d tells another unit")
+
+
+def _climb_unit(gnss: pd.DataFrame, metre: float, speed_unit: Any) -> Finding:
+    """The unit of the speed or m/s, whichever agrees with the heights of ``metre`` m; m/s where these do not tell."""
+    t, height, down = (gnss[name].to_numpy() for name in ("t", "height_m", "vel_d"))
+    climb = compare_climbs(t, metre * height, down)
+    setting, usual = "gnss.velocity.climb_unit", speed_unit if speed_unit in METRIC else "m/s"
+    if climb is None or climb.slope <= 0 or climb.alike < CLIMBS_ALIKE:
+        return Finding(setting, usual, True, "no heights tell another unit")
+    size = climb.slope / climb.alike  # noise of the climb makes the slope less
+    factors = {unit: units.factor(unit, units.SPEED, setting) for unit in ("m/s", speed_unit or "m/s")}
+    best = min(factors, key=lambda unit: abs(np.log(size / factors[unit])))
+    return Finding(setting, best, True, f"heights change {climb.slope:.3g} ± {climb.std:.1g} m per unit and second")
 
 
 def _unit_by_way(t: np.ndarray, lat_deg: np.ndarray, lon_deg: np.ndarray, speed: np.ndarray) -> Finding:
@@ -200,7 +222,8 @@ def _refuse_doubt(found: list[Finding], wanted: set[str], where: str, t: Mapping
 def _describe_by_hand(doubts: list[Finding], wanted: set[str], t: Mapping[str, np.ndarray]) -> str:
     """The settings of everything in doubt, with their usual values and when these are right."""
     said = []
-    for setting in (doubt.setting for doubt in doubts):
+    for doubt in doubts:
+        setting = doubt.setting
         if setting.endswith("offset_s"):
             within = (t["gnss"] >= t["imu"][0]) & (t["gnss"] <= t["imu"][-1])
             overlap = np.mean(within) > MOSTLY
@@ -209,6 +232,8 @@ def _describe_by_hand(doubts: list[Finding], wanted: set[str], t: Mapping[str, n
         elif setting == "imu.axes":
             names = sorted(wanted & AXES)
             said.append(f"{' '.join(f'reader.{name}=frd' for name in names)} (if x is forward, y right, z down)")
+        elif is_number(doubt.value) and not doubt.std > SURE_SCALE * doubt.value:
+            said.append(f"reader.{setting}={doubt.value}")  # counts, or g of a scale of its own
         else:
             said.append(f"reader.{setting}={USUAL.get(setting, '…')}")
     return " ".join(said)

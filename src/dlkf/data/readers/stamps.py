@@ -24,6 +24,7 @@ NEWEST_UNIX = 2e9  # s: 2033; a stamp beyond it counts from no known epoch
 NAMED_ZONE = r"(?:Z|UTC|GMT|[+-]\d{2}:?\d{2})\s*$"
 QUARTER_S, LEAST_ZONE_S = 900, 3600  # time zones are whole quarters of an hour
 SWITCHED_ON_S = 1000.0  # a log that begins with less counts from its own beginning, which is nothing to report
+XSENS_TICK = "1e-4s"
 OLDEST_UNIX = 1.0e9  # s: 2001; no log of a car with an IMU of this kind is older
 
 
@@ -47,8 +48,8 @@ def time_spec(table: LogTable, rows: pd.Series, slowest: float, fastest: float) 
         date = next((n for n in dates if units.day_of_number(frame[n].iloc[0]) is not None), None)
         of_day: Spec = {"column": column, "unit": units.HHMMSS, "wraps_s": units.DAY_S}
         return of_day if date is None else of_day | {"column": [date, column], "clock": "utc"}
-    if column in called and vocabulary.words(column) == "sample time fine":  # Xsens: ticks of 0.1 ms
-        return {"column": column, "unit": "1e-4s", "wraps_s": 2**32 / 10_000}
+    if column in called and vocabulary.words(column) == "sample time fine":
+        return {"column": column, "unit": XSENS_TICK, "wraps_s": 2**32 / 10_000}
     unit = time_unit(values, slowest, fastest)
     if unit is None and (days := _counts_days(frame[column], slowest)) is not None:
         return {"column": column, "unit": days, "clock": "utc"}
@@ -198,7 +199,8 @@ def epoch_note(part: Mapped) -> str | None:
     known = {"unix": "unix", "utc": "unix", "gps": "gps"}.get(str(clock)) or units.clock_by_size(seconds)
     dates = _dates(seconds)
     if known is None:
-        if part.kind != "gnss" or not SWITCHED_ON_S < seconds < units.WEEK_S:
+        counter = time.get("unit") == XSENS_TICK  # runs since the device was switched on
+        if part.kind != "gnss" or counter or not SWITCHED_ON_S < seconds < units.WEEK_S:
             return None
         if seconds < units.DAY_S and not vocabulary.has(str(column), r"\b(?:tow|sow|itow|week)\b"):
             return (

@@ -219,7 +219,8 @@ def _calendar(values: np.ndarray, where: str, order: str | None = None) -> np.nd
     if order not in (None, *ORDERS):
         raise InputError(f"{where}.order={order}: must be {', '.join(ORDERS)}, or null")
     texts = pd.Series(values).astype(str).str.strip().str.replace(r"[年月](?=\d)", "-", regex=True)
-    texts = texts.str.replace(r"(:\d{2}),(\d)", r"\1.\2", regex=True).str.replace("日", "", regex=False)
+    texts = texts.str.replace(r"(:\d{2})(?:,(?=\d)|:(?=\d{3}\b))", r"\1.", regex=True)
+    texts = texts.str.replace("日", "", regex=False)
     texts = texts.str.replace(r"^(\d{1,2}[./]\d{1,2}[./])(\d{2})(?!\d)", r"\g<1>20\2", regex=True)
     order = day_order(texts) if order in (None, "ymd") else order
     if order == "":

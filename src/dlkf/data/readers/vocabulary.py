@@ -11,19 +11,20 @@ import unicodedata
 from collections.abc import Iterable, Sequence
 from itertools import chain
 
-RECEIVER = r"(?:(?:gps|gnss|loc(?:ation)?|rtk|ublox|nmea|receiver|nav|fix) )?"
+RECEIVERS = r"gps|gnss|loc(?:ation)?|rtk|ublox|nmea|receiver|nav|fix|pos(?: lla)?"
+RECEIVER = rf"(?:(?:{RECEIVERS}) )?"
 NORTH, EAST = r"n(?:orth|ord)?|lat(?:itude)?|norte?", r"e(?:ast)?|lon(?:gitude)?|ost|est|este"
 DOWN, UP = r"d(?:own)?", r"u(?:p)?|alt(?:itude)?|h(?:eight)?"
 ACCURACY = r"(?:acc(?:uracy)?|error|err|std|sigma|genauigkeit|fehler|precision|exactitud|incertitude|精度|误差|誤差)"
 CARRIER = r"carr(?:ier)? ?soln?"
-VELOCITY = r"v(?:el(?:ocity)?)?|velocity|geschwindigkeit|vitesse|velocidad|速度"
+VELOCITY = r"v(?:el(?:ocity)?)?(?: ned)?|geschwindigkeit|vitesse|velocidad|速度"
 
 SENSORS = {
     "accel": r"(?:(?:total|raw) )?(?:acc(?:el(?:eration|erometer|erometre)?)?|specific ?force|g ?force|force|f|a|fb"
     r"|accelerometer acceleration|beschl(?:eunigung(?:ssensor|smesser)?)?|acel(?:er(?:acion|ometro)?)?"
     r"|加速度(?:计|計|センサ|センサー)?)",
-    "gyro": r"(?:raw )?(?:gyr?o?(?:s[ck]op(?:e|io)?|met(?:er|re))?|omega|w|g|ang(?:ular)? ?(?:velocity|vel|rate|speed)"
-    r"|rate|(?:motion )?(?:rotation|turn) ?rate|gyro(?:scope)? rotation|wb"
+    "gyro": r"(?:raw )?(?:gyr?o?(?:s[ck]op(?:e|io)?|met(?:er|re))?|omega|w|g"
+    r"|ang(?:le|ular)? ?(?:velocity|vel|rate|speed)|rate|(?:motion )?(?:rotation|turn) ?rate|gyro(?:scope)? rotation|wb"
     r"|drehrate|drehgeschwindigkeit|winkelgeschwindigkeit|kreisel|vitesse (?:angulaire|de rotation)"
     r"|giro(?:scopi?o|metro)?"
     r"|velocidad angular|角速度|陀螺仪?|陀螺儀|ジャイロ(?:センサー?)?)",
@@ -35,14 +36,17 @@ AXES = {
     for axis in (*"xyz012", *ANGLES)
 }
 
+ELLIPSOIDAL = [r"ell?ip\w*(?: (?:height|alt(?:itude)?|hoe?he))?|h ell|(?:alt(?:itude)?|height) wgs ?84"]
+ELLIPSOIDAL += [r"(?:(?:h(?:eight)?|hgt|alt(?:itude)?) ?)?hae"]
+ELLIPSOIDAL += [r"(?:height|alt(?:itud|itude|ura)?|hauteur|elevacion|hoe?he) ell?\w*|大地高|椭球高|橢球高|楕円体高"]
+SEA_LEVEL = r"(?:h|height|alt(?:itude)?|ele\w*) ?(?:msl|amsl|asl)|h ?msl"
 QUANTITIES: dict[str, list[str]] = {
     "lat": [r"lat(?:itude?)?", r"(?:geo\w* )?breite(?:ngrad)?", r"latitud|phi|纬度|緯度|北纬|北緯"],
     "lon": [r"lon(?:gitude?)?|lng|long", r"(?:geo\w* )?la?enge|(?:geo\w* )?lange|(?:laengen|langen)grad"]
     + [r"longitud|lambda|lam|经度|經度|経度|东经|東経"],
-    "height": [r"ell?ip\w*(?: (?:height|alt(?:itude)?|hoe?he))?|h ell|(?:alt(?:itude)?|height) wgs ?84"]
-    + [r"(?:height|alt(?:itud|itude|ura)?|hauteur|elevacion|hoe?he) ell?\w*|大地高|椭球高|橢球高|楕円体高"]
+    "height": [*ELLIPSOIDAL]
     + [r"h|hgt|height|alt(?:itude)?|ele(?:v|vation)?|hoe?he(?: (?:uber|ueber) .*)?|hauteur|altitud|altura|elevacion"]
-    + [r"高度|高程|海拔(?:高度)?|标高|標高|高さ", r"(?:h|height|alt(?:itude)?|ele\w*) ?(?:msl|amsl|asl)|h ?msl"],
+    + [r"高度|高程|海拔(?:高度)?|标高|標高|高さ", SEA_LEVEL],
     "geoid": [r"geoid(?: ?sep\w*| ?height| ?undulation)?|undulation|sep|geoidundulation|ondulation"]
     + [r"高程异常|ジオイド高?"],
     "north": [rf"(?:{VELOCITY}) ?(?:n(?:orth|ord)?|norte)|north(?:ward)? ?vel(?:ocity)?|北向速度|北向き速度"],
@@ -59,7 +63,7 @@ QUANTITIES: dict[str, list[str]] = {
     "quality": [r"quality|(?:fix|gga|gps) ?quality|qualitat|qualitaet|qualite|calidad"]
     + [r"(?:定位|测位|測位)?(?:质量|品质|品質|質量)"]
     + [r"fix ?(?:typ|type|art|status|mode|qual)?|(?:gps ?)?status|(?:gps ?)?mode|sol(?:ution)?(?: ?(?:type|status))?"]
-    + [CARRIER]
+    + [CARRIER, r"pos(?:ition)? ?type"]
     + [r"rtk(?: ?(?:status|fix|mode|state))?|type de fix|tipo de fix|modo|(?:定位|测位|測位|解)(?:状态|狀態|状態)|q"],
     "hacc": [rf"h(?:or(?:izontal)?)? ?(?:pos(?:ition)? )?{ACCURACY}|eph|pos(?:ition)? ?{ACCURACY}"]
     + [rf"horizontale? ?{ACCURACY}|{ACCURACY} horizontale?|lagegenauigkeit|水平(?:位置)?(?:精度|误差|誤差)"]
@@ -77,6 +81,9 @@ QUANTITIES: dict[str, list[str]] = {
 for _kind, _stem in (("pos", r"(?: ?pos(?:ition)?)?"), ("vel", r" ?v(?:el(?:ocity)?)?")):
     for _axis, _names in (("n", NORTH), ("e", EAST), ("d", rf"{DOWN}|{UP}")):
         QUANTITIES[f"std_{_kind}_{_axis}"] = [rf"(?:std(?:dev)?|sd|sigma){_stem} ?(?:{_names})"]
+for _axis, _names in (("n", "lat(?:itude)?|north"), ("e", "lon(?:gitude)?|east"), ("d", "alt(?:itude)?|height|down")):
+    QUANTITIES[f"std_pos_{_axis}"].append(rf"(?:{_names}) {ACCURACY}")
+    QUANTITIES[f"std_vel_{_axis}"].append(rf"vel(?:ocity)? (?:{_names}) {ACCURACY}")
 
 WHEEL = r"\b(?:wheels?|obd2?|odo(?:meter)?|can|vehicle|car|ecu|rad\w*|tacho\w*|roues?|ruedas?|vehicule|vehiculo)\b"
 WHEEL += r"|[车車轮輪]"
@@ -96,7 +103,7 @@ TIME = (
     r"|stamp|epoch|secs?|seconds|date ?time|milli(?:s|seconds)?"
     r"|micro(?:s|seconds)?|nano(?:s|seconds)?|ms|us|ns|ticks|sample ?time"
     r"|ros ?time|i ?tow|utc ?(?:time|seconds)|seconds ?elapsed|elapsed|sample ?time ?fine|date ?num"
-    r"|(?:location|accelerometer|gyro|motion) timestamp since (?:1970|reboot)"
+    r"|(?:location|accelerometer|gyro|motion) timestamp since (?:1970|reboot)|time since start(?: in)?"
     r"|zeit(?:stempel|punkt)?|uhrzeit|temps|heure|horodatage|tiempo|hora"
     r"|marca de tiempo"
     r"|时间戳?|時間|时刻|時刻|タイムスタンプ)(?: (?:utc|gps|unix|local|lokal))*"
@@ -117,6 +124,7 @@ UNITS = {
     **dict.fromkeys(("cm s", "cmps"), "cm/s"),
     **dict.fromkeys(("rad s", "rps", "rads", "rad sec"), "rad/s"),
     **dict.fromkeys(("deg s", "dps", "grad s", "° s", "deg sec"), "deg/s"),
+    **dict.fromkeys(("mdps", "mdeg s"), "mdeg/s"),
     **dict.fromkeys(("deg", "degree", "degrees", "grad", "°", "度"), "deg"),
     **{
         u: u for u in ["g", "mg", "rad", "m", "mm", "cm", "km", "ft", "s", "ms", "us", "ns", "pa", "hpa", "mbar", "rpm"]
@@ -179,6 +187,24 @@ def find_column(names: Iterable[str], key: str) -> str | None:
             if re.fullmatch(rf"{RECEIVER}(?:{pattern})", said):
                 return name
     return None
+
+
+def find_receiver(name: str) -> str:
+    """The receiver that a name begins with (``rtk`` of ``rtk_lat``) or has in brackets; empty where it has none."""
+    if begins := re.match(rf"({RECEIVERS}) \w", words(name)):
+        return begins[1]
+    in_brackets = re.search(r"[\[(](gps|gnss)[\])]", name, re.IGNORECASE)
+    return in_brackets[1].lower() if in_brackets else ""
+
+
+def is_ellipsoidal(name: str) -> bool:
+    """Whether a height's name says that it is above the ellipsoid."""
+    return any(re.fullmatch(f"{RECEIVER}(?:{pattern})", words(name)) for pattern in ELLIPSOIDAL)
+
+
+def is_wheel(name: str) -> bool:
+    """Whether a name says that a speed is that of a wheel or of the car's bus, and of no receiver."""
+    return not find_receiver(name) and has(re.sub(r"[()\[\]]", " ", name), WHEEL)
 
 
 def match_columns(names: Iterable[str], pattern: str) -> list[str]:
