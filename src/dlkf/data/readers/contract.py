@@ -16,6 +16,7 @@ from dlkf.data.limits import NOWHERE_DEG
 from dlkf.data.readers import units
 from dlkf.data.readers.mapping import Mapped
 from dlkf.data.schema import ACCEL, ATTITUDE, GYRO, POSITION, STD, VELOCITY
+from dlkf.data.validate import usable_fixes
 
 LATE = {"end": 0.0, "middle": 0.5, "start": 1.0}  # of the interval, by which a stamp is early
 ANGLES = {"deg": 1.0, "rad": 1 / units.DEG, "1e-7deg": 1e-7, "ddmm": 1.0}  # degrees per unit
@@ -57,6 +58,16 @@ def gnss_frame(mapped: Mapped, t: np.ndarray) -> pd.DataFrame:
         turn = np.floor((t - t[0]) / float(every) + 1e-6)
         out = out[np.diff(turn, prepend=-1) > 0].reset_index(drop=True)
     return out
+
+
+def drop_zero_stds(fixes: pd.DataFrame) -> tuple[pd.DataFrame, list[str]]:
+    """Fixes with NaN for a 1σ of 0, which a source writes that does not fill it, and a line on how many there are."""
+    zero = fixes[list(STD)] == 0
+    count = int((zero.any(axis=1) & usable_fixes(fixes)).sum())
+    if not count:
+        return fixes, []
+    known = fixes.assign(**fixes[list(STD)].mask(zero))
+    return known, [f"a 1σ of 0 in {count} of {len(fixes)} fixes is taken as unknown: the quality gives it"]
 
 
 def reference_frame(mapped: Mapped, t: np.ndarray) -> pd.DataFrame:
