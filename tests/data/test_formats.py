@@ -63,7 +63,7 @@ RESOLUTION = {
     "novatel": Resolution(accel=8e-7, gyro=5e-8, velocity=5.1e-5, std=False),
     "novatel_x": Resolution(accel=8e-7, gyro=5e-8, velocity=5.1e-5, std=False),
     "ros1": Resolution(std=False),
-    "ros2": Resolution(std=False),
+    "ros2": Resolution(),
     "ros1_nmea": Resolution(position=1e-3, velocity=1e-4, down=False, std=False),
     "ros1_ublox": Resolution(position=1e-2, velocity=5.1e-4, spread=0.02),
     "ros2_ublox": Resolution(position=1e-2, velocity=5.1e-4, spread=0.02),
@@ -115,6 +115,8 @@ def test_the_same_drive(writer, drive, tmp_path):
     else:
         assert gnss[["vel_n", "vel_e", "vel_d"]].isna().all(axis=None)
     np.testing.assert_allclose(gnss.std_pos_e, 0.02, rtol=fine.spread)
+    if writer is logs.gnss_logger:  # with accuracies of its own for heights
+        np.testing.assert_allclose(gnss.std_pos_d, 0.03)
     if fine.std:
         np.testing.assert_allclose(gnss.std_vel_e, 0.05, rtol=fine.spread)
     assert set(gnss.quality) == {4}
