@@ -19,6 +19,7 @@ from dlkf.data.schema import ACCEL, ATTITUDE, GYRO, POSITION, STD, VELOCITY
 from dlkf.data.validate import usable_fixes
 
 LATE = {"end": 0.0, "middle": 0.5, "start": 1.0}  # of the interval, by which a stamp is early
+LOST = 1.5  # usual steps: a longer one has lost rows (dlkf.data.resampling bridges it)
 ANGLES = {"deg": 1.0, "rad": 1 / units.DEG, "1e-7deg": 1e-7, "ddmm": 1.0}  # degrees per unit
 
 
@@ -33,8 +34,9 @@ def imu_frame(mapped: Mapped, t: np.ndarray) -> pd.DataFrame:
         values = values * units.mirror(mapped.spec[key].get("mirror"), f"reader.imu.{key}.mirror")
         turn = units.rotation(mapped.spec[key].get("axes", "frd"), f"reader.imu.{key}.axes")
         if mapped.spec.get("increments"):
+            gained = np.where(step > LOST * usual, usual, step)[:, None]  # in a step of its own after rows were lost
             with np.errstate(divide="ignore"):  # stamps that stand twice are refused with their row later
-                values = np.where(step[:, None] > 0, values / step[:, None], 0.0)
+                values = np.where(gained > 0, values / gained, 0.0)
         out |= dict(zip(names, (values @ turn.T).T))
     stamp = mapped.spec.get("stamp") or "end"
     if stamp not in LATE:
