@@ -68,7 +68,7 @@ def drop_zero_stds(fixes: pd.DataFrame) -> tuple[pd.DataFrame, list[str]]:
     count = int((zero.any(axis=1) & usable_fixes(fixes)).sum())
     if not count:
         return fixes, []
-    known = fixes.assign(**fixes[list(STD)].mask(zero))
+    known = fixes.assign(**{name: fixes[name].mask(zero[name]) for name in STD})
     return known, [f"a 1σ of 0 in {count} of {len(fixes)} fixes is taken as unknown: the quality gives it"]
 
 
