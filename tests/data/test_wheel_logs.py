@@ -66,6 +66,7 @@ DAMAGES = {
     "gaps all over": lambda v: np.where(np.sin(T / 20) > 0.6, np.nan, v),
     "marks of 16 bits": lambda v: np.where(np.arange(len(T)) % 300 == 7, 65535.0, v),
     "one wild value": lambda v: np.where(np.arange(len(T)) == 3000, 36_947.0, v),
+    "locked wheels for 2 s": lambda v: np.where((T >= 150) & (T <= 152), 0.0, v),
     "a locked wheel for 10 s": lambda v: np.where((T > 200) & (T < 210), 0.0, v),
 }
 

@@ -22,7 +22,7 @@ FINE_S, REACH_S = 0.02, 1.0  # of the search between the steps
 MOVING = 2.0  # m/s
 LEAST_ALIKE, LEAST_GAIN = 0.9, 15.0
 IMPOSSIBLE = 3.0  # times the largest speed of GNSS, by what both have in their faster fifth: marks, damage
-OUTLYING, LEAST_RESIDUAL = 5.0, 0.05  # median residuals; the median is at least so much of the mean speed
+OUTLYING, LEAST_RESIDUAL = 5.0, 0.05  # median residuals; of the mean speed at least
 WHITE_S = 1.0  # residuals of a receiver's speed are alike over so long
 
 
@@ -122,12 +122,15 @@ def _between(t: Floats, speed: Floats, gnss: Motion, lag_s: float, clear: bool) 
 
 
 def _reject_outliers(shifted: Floats, ground: Floats) -> np.ndarray:
-    """Rows (n,) without outliers: residuals of at most five medians, at the lag (n, lags) with the least mean magnitude
-    of them, with the scale of the median ratio."""
+    """Rows (n,) whose residuals are at most five medians at the lag (n, lags) with the least mean magnitude of them,
+    where those beyond count no more than that; the scale is the median ratio."""
     fast = ground > MOVING
     if fast.sum() < 10:
         return np.ones(len(ground), bool)
     ratio = np.median(ground[fast, None] / np.maximum(shifted[fast], 1e-9), 0)
     off = np.abs(ratio * shifted - ground[:, None])
-    best = off[:, int(off.mean(0).argmin())]
-    return best <= OUTLYING * max(float(np.median(best)), LEAST_RESIDUAL * float(ground.mean()) / OUTLYING)
+    most = np.inf
+    for _ in range(3):
+        best = off[:, int(np.minimum(off, most).mean(0).argmin())]
+        most = max(OUTLYING * float(np.median(best)), LEAST_RESIDUAL * float(ground.mean()))
+    return np.asarray(best <= most)
