@@ -149,6 +149,18 @@ def test_increments_and_stamps_at_the_start(tmp_path, tables):
         np.testing.assert_allclose(drive.imu[name], tables["imu"][name], atol=1e-9)
 
 
+def test_increments_after_lost_rows_are_of_their_own_step(tmp_path, tables):
+    """A row has what was gained since the sample before it, whether that was logged or not."""
+    lost = np.arange(len(tables["imu"])) % 100 == 50
+    lost |= np.arange(len(lost)) % 100 == 51
+    imu = tables["imu"][~lost]
+    gained = imu.assign(**{name: imu[name] * 0.01 for name in imu if name != "t"})
+    _plain(tmp_path / "a", {**tables, "imu": gained})
+    (drive,) = log_reader(imu__increments=True).read(tmp_path / "a")
+    for name in imu:
+        np.testing.assert_allclose(drive.imu[name], imu[name], atol=1e-9)
+
+
 def test_a_table_without_header(tmp_path, tables):
     folder = tmp_path / "a"
     folder.mkdir()

@@ -76,6 +76,37 @@ def test_any_pose_and_unit(drive):
     assert abs(pose.lever_arm) < 0.1
 
 
+def test_fast_fixes_make_no_more_intervals(drive):
+    """Up to 20 Hz one from every fix; beyond, five to eleven that overlap, and the same pose."""
+    for hz, phase in ((1, 1), (5, 1), (10, 1), (20, 1), (50, 4), (100, 9)):
+        gnss = find_motion(car(100, gnss_hz=hz)["gnss"])
+        first, last = gnss.intervals(overlapping=True)
+        assert gnss.phase == phase and len(first) <= 100 * 20 and (last - first == gnss.stride).all()
+    t, accel, gyro, _ = _arrays(drive)
+    pose = find_pose(t, accel, gyro, gnss, 0.0)
+    assert pose is not None and abs(pose.lag_s) < 2e-3
+    assert math.degrees(Rotation.from_matrix(pose.matrix @ TURN).magnitude()) < 0.1
+
+
+@pytest.mark.parametrize("name, value", [("ax", -9999.0), ("gz", -32768.0), ("gz", 400.0)])
+def test_a_damaged_sample_takes_nothing_from_what_is_found(tmp_path, drive, name, value):
+    """Beyond full scale, or a spike, in g and °/s that are yet to be found."""
+    imu = drive["imu"]
+    table = {"time": imu.t, **{f"a{x}": imu[f"accel_{x}"] / 9.80665 for x in "xyz"}}
+    table |= {f"g{x}": np.degrees(imu[f"gyro_{x}"]) for x in "xyz"}
+    whole, damaged = pd.DataFrame(table), pd.DataFrame(table)
+    damaged.loc[[3000, 7000], name] = value
+    found = []
+    for folder, one in ((tmp_path / "whole", whole), (tmp_path / "damaged", damaged)):
+        folder.mkdir()
+        one.to_csv(folder / "imu.csv", index=False)
+        drive["gnss"].to_csv(folder / "gnss.csv", index=False)
+        (got,) = AutoReader().read(folder)
+        found.append({key: got.mapping["imu"][key]["unit"] for key in ("accel", "gyro")})
+        found[-1]["offset_s"] = got.mapping["gnss"]["time"]["offset_s"]
+    assert found[0] == found[1] == {"accel": "g", "gyro": "deg/s", "offset_s": 0.0}
+
+
 @pytest.mark.parametrize("decades_s", [0.0, -1.457507878e9])  # a counter that began today, beside GPS time
 @pytest.mark.whole
 def test_clocks_that_drift_apart(drive, decades_s):

@@ -63,7 +63,7 @@ RESOLUTION = {
     "novatel": Resolution(accel=8e-7, gyro=5e-8, velocity=5.1e-5, std=False),
     "novatel_x": Resolution(accel=8e-7, gyro=5e-8, velocity=5.1e-5, std=False),
     "ros1": Resolution(std=False),
-    "ros2": Resolution(std=False),
+    "ros2": Resolution(),
     "ros1_nmea": Resolution(position=1e-3, velocity=1e-4, down=False, std=False),
     "ros1_ublox": Resolution(position=1e-2, velocity=5.1e-4, spread=0.02),
     "ros2_ublox": Resolution(position=1e-2, velocity=5.1e-4, spread=0.02),
@@ -115,6 +115,8 @@ def test_the_same_drive(writer, drive, tmp_path):
     else:
         assert gnss[["vel_n", "vel_e", "vel_d"]].isna().all(axis=None)
     np.testing.assert_allclose(gnss.std_pos_e, 0.02, rtol=fine.spread)
+    if writer is logs.gnss_logger:  # with accuracies of its own for heights
+        np.testing.assert_allclose(gnss.std_pos_d, 0.03)
     if fine.std:
         np.testing.assert_allclose(gnss.std_vel_e, 0.05, rtol=fine.spread)
     assert set(gnss.quality) == {4}
@@ -234,6 +236,25 @@ def test_units_that_some_columns_lack_stand_under_their_names(tmp_path):
     table = novatel.read(tmp_path / "town.txt", kind="gnss", table=None, text={}).frame
     np.testing.assert_allclose(table["Latitude"], [-48.5, -48.51])
     assert list(table["Name"]) == ["a", "b"] and list(table["Q"]) == [1, 1]
+
+
+def test_the_latency_of_novatels_velocities_is_taken_off(tmp_path):
+    """Dopplers of 0.25 s before under steady acceleration; none for the last fix, nor beside one that is missing."""
+    lines, t = [], np.arange(20.0)
+    for s in t:
+        head = f"COM1,0,90.0,FINESTEERING,2350,{1000 + s:.3f},02000040,cdba,15823;SOL_COMPUTED"
+        lines.append(f'#BESTPOSA,{head},SINGLE,52.1,9.9,35.0,45.0,WGS84,1,1,2,"",0,0,20,18,18,18,00,06,39,33')
+        if s != 10:
+            north, east, up = 3 + (s - 0.25), 2 * (s - 0.25), 0.1 * (s - 0.25)
+            course = np.degrees(np.arctan2(east, north))
+            cells = f"DOPPLER_VELOCITY,0.250,0.000,{np.hypot(north, east):.7f},{course:.7f},{up:.7f},0.0"
+            lines.append(f"#BESTVELA,{head},{cells}")
+    (tmp_path / "town.asc").write_text("\n".join(lines))
+    table = novatel.read(tmp_path / "town.asc", kind="gnss", table=None, text={})
+    assert "up to 0.25 s older than their stamps" in table.notes[0]
+    want = np.stack((3 + t, 2 * t, -0.1 * t), -1)
+    want[[9, 10, 19]] = np.nan
+    np.testing.assert_allclose(table.frame[["vel_n", "vel_e", "vel_d"]], want, atol=1e-5)
 
 
 def test_minutes_and_seconds_west_of_greenwich_keep_their_sign(tmp_path):

@@ -119,6 +119,17 @@ def test_degrees_and_minutes_with_hemispheres(tmp_path, tables):
         read(tmp_path, tables, gnss__position__unit="ddmm", gnss__position__hemispheres=["ns", "ew"])
 
 
+def test_a_1σ_of_0_is_unknown_and_a_line_says_so(tmp_path, tables):
+    gnss = tables["gnss"].copy()
+    gnss.loc[:9, ["std_pos_n", "std_vel_d"]] = 0.0
+    gnss.loc[0, "quality"] = 0  # no fix: nothing is said of it
+    gnss.to_csv(tmp_path / "gnss.csv", index=False)
+    drive = read(tmp_path, tables)
+    assert drive.gnss.std_pos_n.isna().sum() == drive.gnss.std_vel_d.isna().sum() == 10
+    assert not drive.gnss[["std_pos_e", "std_vel_n"]].isna().any(axis=None)
+    assert sum("a 1σ of 0 in 9 of" in note for note in drive.notes) == 1
+
+
 def test_height_above_sea_level(tmp_path, tables):
     gnss = tables["gnss"]
     gnss.assign(height_m=gnss.height_m - 47.1, undulation=47.1).to_csv(tmp_path / "gnss.csv", index=False)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from dlkf.data.intake import ingest_drives
 from dlkf.data.readers.auto import AutoReader
 from dlkf.data.readers.formats import rosbag
 from dlkf.data.readers.offers import recognise_file
-from dlkf.data.schema import ACCEL, GYRO
+from dlkf.data.schema import ACCEL, GYRO, STD
 from tests.cars import car
 from tests.data.logs import metres
 from tests.data.logs.autopilots import ardupilot, px4
@@ -155,3 +156,15 @@ def test_nmea_gns(tmp_path, tables, modes, quality):
     imu_table(tmp_path, tables["imu"], UNIX * 1000 + (1000 * tables["imu"]["t"]).round(6))
     (got,) = read(tmp_path, ["reader=nmea", "reader.imu.time.unit=ms"])
     assert set(got.gnss.quality) == {quality} and metres(got.gnss, tables["gnss"]).max() < 1e-3
+
+
+@pytest.mark.parametrize(("variance", "std"), [(-1.0, np.nan), (0.0, 0.0), (0.25, 0.5)])
+def test_a_covariance_that_a_driver_does_not_know_is_unknown(variance, std):
+    """A variance of −1 is unknown (sensor_msgs); one of 0 stays, and the table of the fixes takes it for unknown."""
+    linear, covariance = SimpleNamespace(x=1.0, y=2.0, z=3.0), np.full(36, variance)
+    twist = SimpleNamespace(twist=SimpleNamespace(linear=linear), covariance=covariance)
+    of_twist = rosbag.VELOCITIES["geometry_msgs/TwistWithCovarianceStamped"](SimpleNamespace(twist=twist))
+    fix = SimpleNamespace(latitude=52.0, longitude=10.0, altitude=80.0, position_covariance_type=1)
+    fix.position_covariance = covariance[:9]
+    of_fix = rosbag.FIX["sensor_msgs/NavSatFix"](fix)
+    np.testing.assert_array_equal([(of_fix | of_twist)[name] for name in STD], [std] * 6)

@@ -157,6 +157,17 @@ def test_unknown_stds_and_velocities():
     assert np.isfinite(fixes.v_e[:4]).all()
 
 
+def test_a_std_of_0_is_unknown():
+    """Drivers that do not know it leave it at zero; one that is small is taken, down to a millimetre."""
+    gnss = _gnss(np.arange(4.0))
+    gnss["quality"] = np.full(4, 1)
+    for name in STD:
+        gnss[name] = np.array([0.0, np.nan, 1e-9, 0.7])
+    std = assign_fixes(gnss, SampleGrid(0.0, 1.0, 3, 50)).std
+    np.testing.assert_array_equal(std[0], [2.5, 2.5, 3.75, 0.2, 0.2, 0.2])
+    np.testing.assert_array_equal(std[1:], [[*std[0]], [1e-3] * 6, [0.7] * 6])
+
+
 def test_a_row_without_a_position_has_no_say_in_the_phase():
     t, gnss = np.arange(0, 20, 0.02), _gnss(np.arange(2.0, 18.0) + 0.4)
     imu = _imu(t, np.tile([0, 0, -9.81, 0, 0, 0], (len(t), 1)))

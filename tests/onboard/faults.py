@@ -293,6 +293,7 @@ FAULTS: dict[str, tuple[Fault, tuple[str, ...]]] = {
         _changed("gnss", lambda t: t < 44, lambda x: _put(x, 1, -x[1])), ("implausible_fix",)),  # lost again and again
     "wheel speeds at 100 Hz, some again after three seconds": (_fast_speeds, ("double",)),
     "no 1σ": (_changed("gnss", lambda t: True, lambda x: _put(x, 5, [nan] * 6)), ()),
+    "a 1σ of 0": (_changed("gnss", lambda t: True, lambda x: _put(x, 5, [0.0] * 6)), ()),
     "fixes 100 m off, one in six": (
         _changed("gnss", lambda t: round(t) % 6 == 3, lambda x: _put(x, 1, x[1] + 9e-4)), ()),
     **{name: (jump, ("implausible_fix",)) for name, jump in JUMPS.items()},

@@ -1,4 +1,4 @@
-"""IMUs of which an axis never changes, or which repeat their last sample, though the car moves."""
+"""IMUs of which an axis does not change, or which repeat their last sample, though the car moves."""
 
 from __future__ import annotations
 
@@ -6,13 +6,19 @@ import numpy as np
 
 from dlkf.base.angles import wrap_angle
 from dlkf.base.errors import InputError
-from dlkf.data.discovery.motion import Motion
+from dlkf.data.discovery.motion import Motion, find_motion
 from dlkf.data.limits import FROZEN_IMU_S, FROZEN_SPEED_M_S, known_speed
 from dlkf.data.schema import ACCEL, GYRO, VELOCITY, stack_columns
 from dlkf.data.tables import Columns
 
 MOVING, TURNED, SPEED_CHANGE = 3.0, 1.0, 3.0  # m/s; rad and m/s over a drive that an axis at work must show
+WAY_S = 5.0
 NOISELESS = 0.2  # of the time in motion that samples repeat
+LEAST_SAME = 10  # samples of an axis that is stuck
+SOME_SAME, COARSE = 0.2, 0.01  # of FROZEN_IMU_S; of the time in motion that a coarse axis repeats so long
+TIMES_USUAL = 10.0  # the longest repeat of an axis at work
+BETWEEN = 20  # changes there are for each time that an axis sticks; of a coarse one fewer
+TURNING_BACK = 0.1  # of its changes: of noise every second one, of a smooth signal none
 
 
 def check_dead_axes(imu: Columns, moved: Motion, where: str, frd: bool = True) -> None:
@@ -39,21 +45,69 @@ def check_dead_axes(imu: Columns, moved: Motion, where: str, frd: bool = True) -
 
 
 def check_frozen(imu: Columns, gnss: Columns, where: str) -> None:
-    """No sample that is the same to the bit for ``FROZEN_IMU_S`` while the car moves.
+    """No sample, and no axis of one, that is the same to the bit for ``FROZEN_IMU_S`` while the car moves.
 
-    Samples without noise, of a simulation, repeat for more than ``NOISELESS`` of the time in motion: they may.
+    Samples without noise, of a simulation, repeat for more than ``NOISELESS`` of the time in motion: they may. So may
+    an axis that is coarse, repeating for a tenth of a second and more for ``COARSE`` of it or hardly ever changing, or
+    without noise.
     """
-    t, speed = imu["t"], known_speed(stack_columns(gnss, VELOCITY))
-    changes = np.zeros(len(t) - 1, bool)
-    for column in (*GYRO, *ACCEL):
-        changes |= np.diff(imu[column]) != 0
-    edges = np.concatenate(([0], np.flatnonzero(changes) + 1, [len(t)]))
-    begin, end = t[edges[:-1]], t[edges[1:] - 1]
-    moves = np.minimum(*(np.interp(x, gnss["t"], speed) for x in (begin, end))) > FROZEN_SPEED_M_S
-    frozen, way = moves & (end - begin > FROZEN_IMU_S), np.interp(t, gnss["t"], speed) > FROZEN_SPEED_M_S
-    if frozen.any() and (end - begin)[frozen].sum() < NOISELESS * np.diff(t)[way[1:]].sum():
-        first, last = begin[frozen][0], end[frozen][0]
-        raise InputError(
-            f"{where}: the same sample from t = {first:.3f} to {last:.3f} while the car moves: a frozen IMU; leave "
-            "these rows out and split the drive there (dlkf.ingest split_gaps=true)"
-        )
+    t, fixes = imu["t"], _find_speeds(gnss)
+    changes = {name: np.diff(imu[name]) != 0 for name in (*GYRO, *ACCEL)}
+    remedy = "leave these rows out and split the drive there (dlkf.ingest split_gaps=true)"
+    begin, end = _find_repeats(t, np.logical_or.reduce([*changes.values()]))
+    frozen = _moves(fixes, begin, end) & (end - begin > FROZEN_IMU_S)
+    if frozen.any():
+        way = _moves(fixes, t, t)
+        if (end - begin)[frozen].sum() < NOISELESS * np.diff(t)[way[1:]].sum():
+            span = f"t = {begin[frozen][0]:.3f} to {end[frozen][0]:.3f}"
+            raise InputError(f"{where}: the same sample from {span} while the car moves: a frozen IMU; {remedy}")
+    for name, changed in changes.items():
+        begin, end = _find_repeats(t, changed)
+        if (end - begin > FROZEN_IMU_S).any() and (stuck := _find_stuck(imu[name], t, begin, end, fixes)) is not None:
+            first, last = stuck
+            raise InputError(
+                f"{where}: {name} stays {imu[name][np.searchsorted(t, first)]:g} from t = {first:.3f} to {last:.3f} "
+                f"while the car moves and other axes change: a stuck axis; {remedy}"
+            )
+
+
+def _find_speeds(gnss: Columns) -> tuple[np.ndarray, np.ndarray]:
+    """Times and speeds [m/s]; of positions alone those of the way in ``WAY_S``, which their noise spoils less."""
+    velocities = stack_columns(gnss, VELOCITY)
+    if np.isfinite(velocities[:, :2]).any():
+        return gnss["t"], known_speed(velocities)
+    moved = find_motion(gnss)
+    if len(moved.t) < 3:
+        return gnss["t"], np.zeros(len(gnss["t"]))
+    width = max(1, round(WAY_S / float(np.median(np.diff(moved.t)))))
+    return moved.t, np.abs(np.convolve(moved.v, np.full(width, 1 / width), mode="same"))[: len(moved.t)]
+
+
+def _find_repeats(t: np.ndarray, changed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Times of the first and the last sample of each stretch without a change (n − 1,)."""
+    edges = np.concatenate(([0], np.flatnonzero(changed) + 1, [len(t)]))
+    return t[edges[:-1]], t[edges[1:] - 1]
+
+
+def _moves(fixes: tuple[np.ndarray, np.ndarray], begin: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Whether the car moves at both times, by the fixes' times and speeds."""
+    return np.minimum(*(np.interp(x, *fixes) for x in (begin, end))) > FROZEN_SPEED_M_S
+
+
+def _find_stuck(
+    x: np.ndarray, t: np.ndarray, begin: np.ndarray, end: np.ndarray, fixes: tuple[np.ndarray, np.ndarray]
+) -> tuple[float, float] | None:
+    """The first of the repeats of an axis (n,) whose time in motion its other ones, and its noise, do not explain."""
+    step = np.diff(t, prepend=t[0])
+    way = np.cumsum(np.where(_moves(fixes, t, t), step, 0.0))
+    length, usual_step = np.interp(end, t, way) - np.interp(begin, t, way), float(np.median(step))
+    long, others = length > FROZEN_IMU_S, length[(length <= FROZEN_IMU_S) & _moves(fixes, begin, end)]
+    coarse = float(others[others >= max(SOME_SAME * FROZEN_IMU_S, 2 * usual_step)].sum())
+    least = max(FROZEN_IMU_S, LEAST_SAME * usual_step, TIMES_USUAL * float(others.max(initial=0.0)))
+    stuck = np.flatnonzero(length > least)
+    if not len(stuck) or coarse > COARSE * (way[-1] - length[long].sum()) or len(others) < BETWEEN * long.sum():
+        return None
+    d = np.diff(x)
+    d = d[d != 0]
+    noisy = len(d) > 2 and np.mean(d[1:] * d[:-1] < 0) > TURNING_BACK
+    return (float(begin[stuck[0]]), float(end[stuck[0]])) if noisy else None

@@ -22,7 +22,7 @@ ON_BOUNDARY_S = 1e-3  # a fix this close to a boundary counts as on it
 LONGEST_BRIDGE_S = 1.1  # the reference is interpolated between samples no further apart
 BLOCK = 4000  # samples of the grid that are composed at a time: what they need stays in the processor's cache
 BEFORE = 3  # samples before the first that a block needs, for the interval before it and whether that is whole
-SMALLEST_STD = 1e-3  # m, m/s: what a source calls zero
+SMALLEST_STD = 1e-3  # m, m/s
 FARTHEST = 2**62  # boundary: where stamps beyond any clock are put
 # horizontal position [m] and velocity [m/s] 1σ where a source gives none, by NMEA GGA quality
 DEFAULT_STD = {4: (0.02, 0.05), 5: (0.3, 0.1), 2: (1.0, 0.1), 3: (1.0, 0.1), 9: (1.0, 0.1), 1: (2.5, 0.2)}
@@ -175,7 +175,7 @@ def assign_fixes(gnss: Columns, grid: SampleGrid) -> FixRows:
     """Each fix to the first boundary at or after it; the latest in an epoch wins.
 
     A position that repeats the one before to the bit is that of the earlier time, so it does not count as a later one.
-    Unknown stds take the defaults of ``DEFAULT_STD``; components that are NaN are not valid.
+    Unknown stds (NaN, 0) take the defaults of ``DEFAULT_STD``; components that are NaN are not valid.
     """
     rows = grid.epochs + 1
     place = find_boundary(gnss["t"], grid)
@@ -201,7 +201,7 @@ def make_fixes(gnss: Columns, rows: np.ndarray, boundaries: np.ndarray) -> FixRo
     quality = gnss["quality"][rows].astype(np.int64)
     default = np.array([default_std(int(q)) for q in quality]).reshape(-1, 6)
     std = np.stack([gnss[c][rows] for c in STD], -1)
-    std = np.maximum(np.where(np.isnan(std), default, std), SMALLEST_STD)
+    std = np.where(std > 0, np.maximum(std, SMALLEST_STD), default)  # a 1σ that a source does not fill is 0
     v_ned = np.stack([gnss[c][rows] for c in VELOCITY], -1)
     known = np.isfinite(v_ned)
     v_e = (C_en @ np.where(known, v_ned, 0.0)[..., None])[..., 0]

@@ -215,9 +215,9 @@ class StreamingFilter:
         """Take a fix of the antenna, instantaneous at ``t`` [s, clock of the samples].
 
         ``velocity_ned`` [m/s] and ``std`` (6: position n, e, d [m], velocity [m/s]) are None or NaN where unknown;
-        unknown stds follow from the ``quality`` (NMEA GGA) as in a log. The receipt of a fix that came after its
-        epoch's end holds the recomputed estimates of all epochs since; a fix that is refused does so too where later
-        fixes, screened again, count otherwise than before.
+        unknown stds (0 too) follow from the ``quality`` (NMEA GGA) as in a log. The receipt of a fix that came after
+        its epoch's end holds the recomputed estimates of all epochs since; a fix that is refused does so too where
+        later fixes, screened again, count otherwise than before.
         """
         fix = check_fix(t, (lat_deg, lon_deg, height_m), velocity_ned, std, quality)
         if isinstance(fix, str):

@@ -63,7 +63,7 @@ class _Bag:
 
 
 def _usual_bag(path: Path, tables: Tables, ros2: bool) -> list[str]:
-    """Imu, NavSatFix, TwistStamped."""
+    """Imu, NavSatFix, TwistStamped; in ROS 2 TwistWithCovarianceStamped."""
     with _Bag(path, ros2) as bag:
         bag.imu(tables, GPS)
         for t, row in zip(nanoseconds(tables["gnss"]["t"], GPS), tables["gnss"].to_dict("records")):
@@ -74,7 +74,12 @@ def _usual_bag(path: Path, tables: Tables, ros2: bool) -> list[str]:
             bag.write("/gnss/fix", int(t), bag.make("sensor_msgs/msg/NavSatFix", **fields))
             v = bag.xyz(row["vel_e"], row["vel_n"], -row["vel_d"])
             twist = bag.make("geometry_msgs/msg/Twist", linear=v, angular=bag.xyz(0.0, 0.0, 0.0))
-            stamped = bag.make("geometry_msgs/msg/TwistStamped", header=bag.header(int(t), "gnss"), twist=twist)
+            kind = "TwistStamped"
+            if ros2:
+                kind, variances = "TwistWithCovarianceStamped", [row[f"std_vel_{a}"] ** 2 for a in "end"]
+                covariance = np.diag([*variances, 0.0, 0.0, 0.0]).ravel()
+                twist = bag.make("geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=covariance)
+            stamped = bag.make(f"geometry_msgs/msg/{kind}", header=bag.header(int(t), "gnss"), twist=twist)
             bag.write("/gnss/vel", int(t), stamped)
     return ["reader=rosbag", "reader.gnss.velocity.table=/gnss/vel", "reader.gnss.quality={default: 4, column: null}"]
 

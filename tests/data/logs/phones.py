@@ -50,7 +50,7 @@ def gnss_logger(folder: Path, tables: Tables) -> list[str]:
     for r in tables["gnss"].assign(course=_course(tables["gnss"])).to_dict("records"):
         speed, ms = np.hypot(r["vel_n"], r["vel_e"]), UNIX * 1000 + round(1000 * r["t"])
         place = f"{r['lat_deg']:.10f},{r['lon_deg']:.10f},{r['height_m']:.4f}"
-        rest = f"{ms},0.05,0.1,{ms}000000,0.02,0,12,0.1,1"
+        rest = f"{ms},0.05,0.1,{ms}000000,0.03,0,12,0.1,1"
         lines.append(f"Fix,GPS,{place},{speed:.6f},0.02,{r['course']:.6f},{rest}")
         lines.append(f"Fix,NLP,{r['lat_deg'] + 0.001:.10f},{r['lon_deg']:.10f},0.0,0.0,35.0,0.0,{rest}")
     (folder / "gnss_log_drive.txt").write_text("\n".join(lines) + "\n")

@@ -20,6 +20,7 @@ Complex = NDArray[np.complexfloating]
 
 MOVING, RESTING = 2.0, 0.3  # m/s: above, the course is known; below, the car stands
 LONGEST_STEP_S = 2.5  # fixes further apart make no interval
+PHASES = 5  # intervals that overlap: of fixes at 50 Hz one from every fix would say no more, and take long
 SHORTEST_STEP_S = 0.45  # of faster fixes intervals span several: the noise of a difference grows with its rate
 
 
@@ -45,9 +46,14 @@ class Motion:
         """Course over ground [rad], clockwise from North."""
         return np.angle(self.v)
 
+    @property
+    def phase(self) -> int:
+        """Fixes from the beginning of an overlapping interval to that of the next one."""
+        return max(1, self.stride // PHASES)
+
     def intervals(self, overlapping: bool = False) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """First and last rows of the intervals, end to end, or one from every fix."""
-        first = np.arange(0, max(len(self.t) - self.stride, 0), 1 if overlapping else self.stride)
+        """First and last rows of the intervals, end to end, or of ``PHASES`` and more (one from every fix at most)."""
+        first = np.arange(0, max(len(self.t) - self.stride, 0), self.phase if overlapping else self.stride)
         first = first[self.t[first + self.stride] - self.t[first] <= LONGEST_STEP_S]
         return first, first + self.stride
 

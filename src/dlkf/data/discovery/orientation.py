@@ -295,7 +295,8 @@ def _intervals(gnss: Motion) -> _Intervals:
     dv = gnss.v[last] - gnss.v[first]
     v0, v1 = gnss.speed[first], gnss.speed[last]
     slopes = np.where(moving, slope, 0.0)
-    return _Intervals(t0, t1, dv, slopes, turned, np.minimum(slow, 15.0), v0, v1, moving, block, gnss.stride)
+    weight, overlap = np.minimum(slow, 15.0), round(gnss.stride / gnss.phase)
+    return _Intervals(t0, t1, dv, slopes, turned, weight, v0, v1, moving, block, overlap)
 
 
 def _gyro_scale(t: Floats, rate: Floats, parts: _Intervals, lag_s: float) -> float | None:

@@ -2,8 +2,8 @@
 
 Both speeds lie on a grid of half a second and are correlated over all lags at which the logs overlap, by FFT
 (normalised correlation with masks, Padfield 2012); then the offset between the steps is that of the least sum of
-squares of scale · wheel(t − lag) − GNSS(t), its 1σ from the residuals over the accelerations:
-σ² = s² / Σ (dv/dt)².
+squares of scale · wheel(t − lag) − GNSS(t), without outliers (slip, damaged speeds) and where the wheel has samples
+near, its 1σ from the residuals over the accelerations: σ² = s² / Σ (dv/dt)².
 """
 
 from __future__ import annotations
@@ -21,6 +21,8 @@ NEIGHBOUR_S = 5.0  # lags this close belong to one peak
 FINE_S, REACH_S = 0.02, 1.0  # of the search between the steps
 MOVING = 2.0  # m/s
 LEAST_ALIKE, LEAST_GAIN = 0.9, 15.0
+IMPOSSIBLE = 3.0  # times the largest speed of GNSS, by what both have in their faster fifth: marks, damage
+OUTLYING, LEAST_RESIDUAL = 5.0, 0.05  # median residuals; of the mean speed at least
 WHITE_S = 1.0  # residuals of a receiver's speed are alike over so long
 
 
@@ -40,6 +42,10 @@ def find_wheel(t: Floats, speed: Floats, gnss: Motion) -> Wheel | None:
     common, or the car keeps its speed."""
     good = np.isfinite(speed)
     t, speed = t[good], np.abs(speed[good])
+    if len(t) and len(gnss.t):
+        usual, ground = float(np.quantile(speed, 0.8)), float(np.quantile(gnss.speed, 0.8))
+        good = speed * ground <= IMPOSSIBLE * usual * gnss.speed.max() if usual > 0 else np.ones(len(t), bool)
+        t, speed = t[good], speed[good]
     if len(t) < 20 or len(gnss.t) < 20 or np.ptp(speed) == 0 or np.ptp(gnss.speed) < MOVING:
         return None
     wheel, here = _resample(t, speed)
@@ -59,9 +65,14 @@ def find_wheel(t: Floats, speed: Floats, gnss: Motion) -> Wheel | None:
 def _resample(t: Floats, v: Floats) -> tuple[Floats, Floats]:
     """Speeds on the grid from the first stamp on, and 1 where there are samples near."""
     grid = np.arange(t[0], t[-1] + STEP_S / 2, STEP_S)
-    nearest = np.abs(t[np.clip(np.searchsorted(t, grid), 0, len(t) - 1)] - grid)
-    usual = float(np.median(np.diff(t)))
-    return np.interp(grid, t, v), (nearest <= max(2 * usual, STEP_S)).astype(float)
+    return np.interp(grid, t, v), _is_near(t, grid).astype(float)
+
+
+def _is_near(t: Floats, at: Floats) -> np.ndarray:
+    """Whether there is a sample near each time, on either side."""
+    after = np.clip(np.searchsorted(t, at), 0, len(t) - 1)
+    apart = np.maximum(np.abs(t[after] - at), np.abs(at - t[np.maximum(after - 1, 0)]))
+    return apart <= max(2 * float(np.median(np.diff(t))), STEP_S)
 
 
 def _correlations(a: Floats, a_there: Floats, b: Floats, b_there: Floats) -> tuple[Floats, Floats]:
@@ -90,7 +101,13 @@ def _between(t: Floats, speed: Floats, gnss: Motion, lag_s: float, clear: bool) 
     if inside.sum() < 10:
         return None
     at, ground = gnss.t[inside], gnss.speed[inside]
+    near = _is_near(t, at[:, None] - lags).all(1)
+    at, ground = at[near], ground[near]
     shifted = np.interp(at[:, None] - lags, t, speed)
+    keep = _reject_outliers(shifted, ground)
+    if keep.sum() < 10:
+        return None
+    at, ground, shifted = at[keep], ground[keep], shifted[keep]
     scale = (shifted * ground[:, None]).sum(0) / np.maximum((shifted * shifted).sum(0), 1e-12)
     left = np.mean((scale * shifted - ground[:, None]) ** 2, 0)
     best = int(left.argmin())
@@ -102,3 +119,18 @@ def _between(t: Floats, speed: Floats, gnss: Motion, lag_s: float, clear: bool) 
     scale_std = np.sqrt(apart * left[best] / max(float((shifted[:, best] ** 2).sum()), 1e-12))
     alike = float(np.corrcoef(shifted[:, best], ground)[0, 1]) if np.ptp(shifted[:, best]) > 0 else 0.0
     return Wheel(float(lag), float(std), float(scale[best]), float(scale_std), alike, clear)
+
+
+def _reject_outliers(shifted: Floats, ground: Floats) -> np.ndarray:
+    """Rows (n,) whose residuals are at most five medians at the lag (n, lags) with the least mean magnitude of them,
+    where those beyond count no more than that; the scale is the median ratio."""
+    fast = ground > MOVING
+    if fast.sum() < 10:
+        return np.ones(len(ground), bool)
+    ratio = np.median(ground[fast, None] / np.maximum(shifted[fast], 1e-9), 0)
+    off = np.abs(ratio * shifted - ground[:, None])
+    most = np.inf
+    for _ in range(3):
+        best = off[:, int(np.minimum(off, most).mean(0).argmin())]
+        most = max(OUTLYING * float(np.median(best)), LEAST_RESIDUAL * float(ground.mean()))
+    return np.asarray(best <= most)

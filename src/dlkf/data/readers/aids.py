@@ -15,7 +15,9 @@ from dlkf.base.errors import InputError
 from dlkf.data.discovery.clock import describe_offset
 from dlkf.data.discovery.motion import Motion, find_motion
 from dlkf.data.discovery.wheel import Wheel, find_wheel
+from dlkf.data.limits import FASTEST_M_S
 from dlkf.data.readers import units
+from dlkf.data.readers.counters import count_rates
 from dlkf.data.readers.mapping import Mapped
 from dlkf.data.validate import usable_fixes
 
@@ -23,6 +25,8 @@ AUTO = "auto"
 PRESSURE = {"pa": 1.0, "hpa": 100.0, "mbar": 100.0, "kpa": 1000.0}
 TURNS = {"rpm": 1 / 60, "turns": 1.0}  # turns (a second), with radius_m
 COUNTS = ("ticks", "turns", "m")  # what has been gained since the beginning; its rate is the speed
+UNKNOWN = -1  # of a column that has no other number below zero
+MOST_BEYOND = 0.05  # of a wheel's rows, faster than any car: more are of another unit
 NEAR = 0.15  # of a wheel's scale from a known unit: tyres differ by some per cent
 
 
@@ -48,10 +52,22 @@ def read_aids(
         spec, found = _settle_auto(name, part, zero, gnss, moved, f"{where}: {part.table.path.name}")
         done = replace(part, spec=spec)
         frames[name], specs[name] = aid_frame(name, done, _times(done, zero)), spec
+        if name == "speed":
+            frames[name], beyond = _drop_impossible(frames[name], part.table.path.name)
+            found += beyond
         if not len(frames[name]):
             raise InputError(f"{where}: {part.table.path.name} has no value of {name}; set reader.{name}.file=null")
         notes += found
     return frames, specs, notes
+
+
+def _drop_impossible(frame: pd.DataFrame, name: str) -> tuple[pd.DataFrame, list[str]]:
+    """The rows of a wheel that some car can drive, and a line on the others; all where many are beyond that."""
+    beyond = frame["speed"].abs() > FASTEST_M_S
+    if not 0 < beyond.mean() <= MOST_BEYOND:
+        return frame, []
+    said = f"left out {int(beyond.sum())} of {len(frame)} speeds of {name}, beyond {FASTEST_M_S:g} m/s"
+    return frame[~beyond].reset_index(drop=True), [said]
 
 
 def _times(mapped: Mapped, zero: int) -> np.ndarray:
@@ -118,11 +134,15 @@ def _speed(mapped: Mapped, t: np.ndarray) -> pd.DataFrame:
     """Forward speed [m/s]: the mean of the columns (wheels of one axle), or of what they gained between two rows,
     which is the speed in the middle between them."""
     entry = mapped.spec["value"]
-    values = np.nanmean(mapped.vector("value", tuple(range(1, 9)), nan=True), axis=1)
+    values = mapped.vector("value", tuple(range(1, 9)), nan=True)
+    backward = ((values < 0) & (values != UNKNOWN)).any(0)
+    values = np.where((values == UNKNOWN) & ~backward, np.nan, values)
     unit = entry.get("unit") or "m/s"
     if _counts(mapped):
-        values = _count_steps(values)
-        t, values = (t[1:] + t[:-1]) / 2, values / np.maximum(np.diff(t), 1e-9)
+        values = np.stack([count_rates(t, one) for one in values.T], -1)
+        t = (t[1:] + t[:-1]) / 2
+    known = np.isfinite(values)
+    values = np.where(known, values, 0.0).sum(1) / np.where(known.any(1), known.sum(1), np.nan)
     scale = _metres_per_unit(entry, unit)
     return pd.DataFrame({"t": t, "speed": values * scale, **(_std(mapped, scale) if len(t) == len(mapped) else {})})
 
@@ -134,14 +154,6 @@ def _counts(mapped: Mapped) -> bool:
         return bool(entry.get("counts", True)) or entry.get("unit") in COUNTS
     first = str(entry["columns"][0]).split(" | ")
     return next((name for name in first if name in mapped.table.frame), "") == "ticks"
-
-
-def _count_steps(values: np.ndarray) -> np.ndarray:
-    """Differences of counters, which begin again at a power of two."""
-    step = np.diff(values)
-    top = float(np.nanmax(np.abs(values), initial=1.0))
-    wrap = 2.0 ** np.ceil(np.log2(max(top, 2.0)))
-    return np.where(step < -wrap / 2, step + wrap, np.where(step > wrap / 2, step - wrap, step))
 
 
 def _metres_per_unit(entry: Mapping[str, Any], unit: Any) -> float:

@@ -16,8 +16,10 @@ from dlkf.data.limits import NOWHERE_DEG
 from dlkf.data.readers import units
 from dlkf.data.readers.mapping import Mapped
 from dlkf.data.schema import ACCEL, ATTITUDE, GYRO, POSITION, STD, VELOCITY
+from dlkf.data.validate import usable_fixes
 
 LATE = {"end": 0.0, "middle": 0.5, "start": 1.0}  # of the interval, by which a stamp is early
+LOST = 1.5  # usual steps: a longer one has lost rows (dlkf.data.resampling bridges it)
 ANGLES = {"deg": 1.0, "rad": 1 / units.DEG, "1e-7deg": 1e-7, "ddmm": 1.0}  # degrees per unit
 
 
@@ -32,8 +34,9 @@ def imu_frame(mapped: Mapped, t: np.ndarray) -> pd.DataFrame:
         values = values * units.mirror(mapped.spec[key].get("mirror"), f"reader.imu.{key}.mirror")
         turn = units.rotation(mapped.spec[key].get("axes", "frd"), f"reader.imu.{key}.axes")
         if mapped.spec.get("increments"):
+            gained = np.where(step > LOST * usual, usual, step)[:, None]  # in a step of its own after rows were lost
             with np.errstate(divide="ignore"):  # stamps that stand twice are refused with their row later
-                values = np.where(step[:, None] > 0, values / step[:, None], 0.0)
+                values = np.where(gained > 0, values / gained, 0.0)
         out |= dict(zip(names, (values @ turn.T).T))
     stamp = mapped.spec.get("stamp") or "end"
     if stamp not in LATE:
@@ -57,6 +60,16 @@ def gnss_frame(mapped: Mapped, t: np.ndarray) -> pd.DataFrame:
         turn = np.floor((t - t[0]) / float(every) + 1e-6)
         out = out[np.diff(turn, prepend=-1) > 0].reset_index(drop=True)
     return out
+
+
+def drop_zero_stds(fixes: pd.DataFrame) -> tuple[pd.DataFrame, list[str]]:
+    """Fixes with NaN for a 1σ of 0, which a source writes that does not fill it, and a line on how many there are."""
+    zero = fixes[list(STD)] == 0
+    count = int((zero.any(axis=1) & usable_fixes(fixes)).sum())
+    if not count:
+        return fixes, []
+    known = fixes.assign(**{name: fixes[name].mask(zero[name]) for name in STD})
+    return known, [f"a 1σ of 0 in {count} of {len(fixes)} fixes is taken as unknown: the quality gives it"]
 
 
 def reference_frame(mapped: Mapped, t: np.ndarray) -> pd.DataFrame:

@@ -22,7 +22,7 @@ from dlkf.data.discovery.findings import Sure
 from dlkf.data.readers import formats
 from dlkf.data.readers.aids import read_aids
 from dlkf.data.readers.archives import drive_name, drive_places, is_archive, unpack
-from dlkf.data.readers.contract import gnss_frame, imu_frame, reference_frame
+from dlkf.data.readers.contract import drop_zero_stds, gnss_frame, imu_frame, reference_frame
 from dlkf.data.readers.formats import rosbag
 from dlkf.data.readers.frames import DriveFrames, Place
 from dlkf.data.readers.mapping import (
@@ -159,6 +159,9 @@ class LogReader:
         meta |= dict(zip(("lever_arm_x_m", "lever_arm_y_m", "lever_arm_z_m"), arm))
         notes = [note for part in every.values() for one in (part, *part.parts.values()) for note in one.table.notes]
         notes += [note for part in mapped.values() if (note := epoch_note(part)) is not None]
+        if "gnss" in frames:
+            frames["gnss"], of_stds = drop_zero_stds(frames["gnss"])
+            notes += of_stds
         if "gnss" in mapped and zone_s:
             file = mapped["gnss"].table.path.name
             notes.append(f"dates of {file}: {zone_s / 3600:+g} h from UTC by the IMU's stamps, so they are local time")
@@ -188,6 +191,9 @@ class LogReader:
                 continue
             own = {**spec, **{s: entry[s] for s in SOURCE if entry.get(s) is not None}}
             parts[key] = select_rows(self._table(folder, own, kind, f"reader.{kind}.{key}", only))
+        of_std = {str(name) for name in spec["std_velocity"]["columns"]} if whole.has("std_velocity") else set()
+        if "velocity" in parts and of_std and of_std <= {str(name) for name in parts["velocity"].table.frame}:
+            parts.setdefault("std_velocity", parts["velocity"])
         return _join_parts(whole, parts) if parts else whole
 
     def _table(self, folder: Path, spec: Spec, kind: str, where: str, only: Path | None) -> Mapped:

@@ -264,14 +264,15 @@ def select_rows(mapped: Mapped) -> Mapped:
     if rows is None:
         return mapped
     if rows in ("filled", "changed"):
-        entries = ("accel", "gyro", "position", "value", "pressure", "height")
+        entries = ("accel", "gyro", "position", "pressure", "height")
         names = {str(n) for key in entries for n in _names(mapped, key)}
         time = mapped.time.get("column")
         names |= {str(n) for n in ([time] if isinstance(time, (str, int)) else time or [])}
         frame = mapped.table.frame
-        cells = frame[[c for c in frame.columns if c in names]]
-        empty = cells.isna() | cells.astype(str).apply(lambda c: c.str.strip() == "")
-        keep = ~empty.any(axis=1).to_numpy()
+        keep = ~_find_empty(frame[[c for c in frame.columns if c in names]]).any(axis=1).to_numpy()
+        some = [c for c in frame.columns if c in {str(n) for n in _names(mapped, "value")}]
+        if some:  # of several wheels one is enough
+            keep &= ~_find_empty(frame[some]).all(axis=1).to_numpy()
         if rows == "changed":
             place = frame.loc[keep, [c for c in frame.columns if c in {str(n) for n in _names(mapped, "position")}]]
             keep[keep] = (place != place.shift()).any(axis=1).to_numpy()
@@ -283,6 +284,10 @@ def select_rows(mapped: Mapped) -> Mapped:
     if not keep.any():
         raise InputError(f"{mapped.table.path}: no row is left by {where}={rows}; set it right")
     return mapped.rows(keep)
+
+
+def _find_empty(cells: pd.DataFrame) -> pd.DataFrame:
+    return cells.isna() | cells.astype(str).apply(lambda c: c.str.strip() == "")
 
 
 def spread_stamps(t: np.ndarray) -> np.ndarray:

@@ -17,13 +17,15 @@ from dlkf.data.dead_sensors import check_dead_axes
 from dlkf.data.discovery.findings import Finding, Sure, discover, find_accel_unit, find_value
 from dlkf.data.discovery.motion import find_motion
 from dlkf.data.discovery.units import CLIMBS_ALIKE, compare_climbs, nearest_unit, speed_factor
+from dlkf.data.limits import within_full_scale
 from dlkf.data.readers import units
 from dlkf.data.readers.contract import gnss_frame, imu_frame, positions
 from dlkf.data.readers.mapping import Mapped
 from dlkf.data.readers.sharing import read_value, set_value, write_value
-from dlkf.data.schema import ACCEL, stack_columns
+from dlkf.data.schema import ACCEL, GYRO, stack_columns
+from dlkf.data.spikes import find_spikes
 from dlkf.data.tables import Columns
-from dlkf.data.validate import check_time, usable_fixes
+from dlkf.data.validate import MOST_REFUSED, check_time, usable_fixes
 
 AUTO = "auto"
 AXES = {"imu.accel.axes", "imu.gyro.axes"}
@@ -44,6 +46,7 @@ FEWEST_FIXES = 3  # below, no finding has a spread
 HIGHEST_M = 9000.0  # of a road
 SURE_SCALE = 0.05  # 1σ of a unit by number that may be given so
 METRIC = ("m/s", "cm/s", "mm/s")
+MOST_TURN = (0.999, 10.0)  # share of the rates; rad/s that no car turns by
 LEAST_GRAVITY = 0.5  # of the mean force: the length of the mean; with gravity in it nearly 1
 
 
@@ -102,7 +105,7 @@ def settle(
         found.append(_speed_unit(mapped["gnss"], t["gnss"]))
         _refuse_doubt(found, wanted, where, t)
         specs["gnss"]["velocity"]["unit"] = found[0].value
-    imu = imu_frame(mapped["imu"], t["imu"])
+    imu = _leave_out_damage(imu_frame(mapped["imu"], t["imu"]), wanted, bool(mapped["imu"].spec.get("increments")))
     if "imu.accel.unit" in wanted:
         _refuse_without_gravity(imu, where)
     gnss = gnss_frame(replace(mapped["gnss"], spec=specs["gnss"]), t["gnss"])
@@ -131,6 +134,22 @@ def settle(
     lever = find_value(found, "lever_arm_m") if "lever_arm_m" in wanted else arm
     x, y, z = (float(a) for a in lever)
     return specs, (x, y, z), _describe_findings(found, wanted)
+
+
+def _leave_out_damage(imu: pd.DataFrame, wanted: set[str], increments: bool) -> pd.DataFrame:
+    """The samples without those beyond full scale and spikes, where they are few, as loading leaves them out.
+
+    A unit that is not known yet is about that of gravity, and of the gyroscopes °/s where they turn by more than
+    ``MOST_TURN``.
+    """
+    accel, gyro = (stack_columns(imu, names) for names in (ACCEL, GYRO))
+    accel = accel * (find_accel_unit(accel, increments)[1] if "imu.accel.unit" in wanted else 1.0)
+    in_degrees = "imu.gyro.unit" in wanted and np.quantile(np.abs(gyro), MOST_TURN[0]) > MOST_TURN[1]
+    gyro = gyro * (units.DEG if in_degrees else 1.0)
+    keep = np.flatnonzero(within_full_scale(accel, gyro))
+    keep = np.delete(keep, find_spikes([*accel[keep].T, *gyro[keep].T]))
+    few = len(imu) - len(keep) <= max(MOST_REFUSED[0] * len(imu), 2)
+    return imu.iloc[keep] if few else imu
 
 
 def _refuse_without_gravity(imu: pd.DataFrame, where: str) -> None:

@@ -186,9 +186,8 @@ static void put_fix(dlkf *d, int64_t row) {
   ecef_from_geodetic(lat, lon, x->height_m, fix->r_e);
   ned_axes(lat, lon, C_en);
   for (int k = 0; k < 6; k++) {
-    double std = x->std[k];
-    if (isnan(std)) std = DEFAULT_STD[x->quality][k];
-    fix->std[k] = std > SMALLEST_STD ? std : SMALLEST_STD;
+    const double std = x->std[k]; /* NaN and 0 are not known */
+    fix->std[k] = !(std > 0) ? DEFAULT_STD[x->quality][k] : std > SMALLEST_STD ? std : SMALLEST_STD;
     fix->used[k] = k < 3 || !isnan(x->v[k - 3]);
   }
   for (int k = 0; k < 3; k++) v_n[k] = fix->used[3 + k] ? x->v[k] : 0;

@@ -234,7 +234,8 @@ void dlkf_lay(dlkf *d, double t, double step_s);
 dlkf_status dlkf_imu(dlkf *d, double t, const double accel[3], const double gyro[3]);
 
 /* A fix of the antenna at t: degrees and metres (ellipsoid), velocity North-East-Down [m/s] or NULL, 1-sigma of position
- * n, e, d [m] and velocity [m/s] or NULL, quality as in NMEA GGA. NAN where the receiver says nothing. */
+ * n, e, d [m] and velocity [m/s] or NULL, quality as in NMEA GGA. NAN where the receiver says nothing; a
+ * 1-sigma of 0 is unknown too. */
 dlkf_status dlkf_gnss(dlkf *d, double t, double lat_deg, double lon_deg, double height_m, const double *velocity_ned,
                       const double *std, int quality);
 

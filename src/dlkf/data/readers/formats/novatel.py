@@ -24,6 +24,9 @@ from dlkf.data.schema import POSITION, STD, VELOCITY
 
 LOG = re.compile(r"^[#%](\w+?)A?,([^;]*);(.*?)(\*[0-9a-fA-F]{8})?$")
 IMUS = ("RAWIMUS", "RAWIMU", "RAWIMUSX", "RAWIMUX")
+COMPUTED = "SOL_COMPUTED"
+EXACT_S = 1e-3  # between the times of a velocity and of a position that are the same
+LONGEST_STEP = 1.5  # usual ones between velocities that are interpolated
 SIZES = {"RAWIMUSX": 2, "RAWIMUX": 2}  # IMU info and type stand before week and seconds
 
 
@@ -133,7 +136,9 @@ def _logs(lines: list[str], path: Path, kind: str, table: str | None) -> LogTabl
     if table == "INSPVA" or (kind == "reference" and "INSPVA" in logs):
         return LogTable(_inspva(logs.get("INSPVA") or _refuse_absent(path, "INSPVA", have)), path, "log")
     positions = logs.get("BESTPOS") or _refuse_absent(path, "BESTPOS", have)
-    return LogTable(_join_best(positions, logs.get("BESTVEL", [])), path, "log")
+    fixes, late_s = _join_best(positions, logs.get("BESTVEL", []))
+    said = f"velocities are up to {late_s:.3g} s older than their stamps (latency of BESTVEL) and were interpolated to"
+    return LogTable(fixes, path, "log", (f"{said} those of the positions",) if late_s > EXACT_S else ())
 
 
 def _refuse_absent(path: Path, name: str, have: str) -> Any:
@@ -153,23 +158,44 @@ def _imu(rows: list[tuple[int, float, list[str]]], skip: int) -> pd.DataFrame:
     return pd.DataFrame(out)
 
 
-def _join_best(
-    positions: list[tuple[int, float, list[str]]], speeds: list[tuple[int, float, list[str]]]
-) -> pd.DataFrame:
-    """BESTPOS (height above sea level and undulation), with the BESTVEL of the same time."""
-    velocity = {}
-    for week, sow, c in speeds:
-        if c[0] == "SOL_COMPUTED":
-            speed, course, up = float(c[4]), np.radians(float(c[5])), float(c[6])
-            velocity[week, sow] = (speed * np.cos(course), speed * np.sin(course), -up)
+Rows = list[tuple[int, float, list[str]]]  # of a log: week, seconds of the week, cells
+
+
+def _join_best(positions: Rows, speeds: Rows) -> tuple[pd.DataFrame, float]:
+    """BESTPOS (height above sea level and undulation), with the velocities at its times; the largest latency [s]."""
     rows = []
     for week, sow, c in positions:
         llh = (float(c[2]), float(c[3]), float(c[4]) + float(c[5]))
         row: dict[str, Any] = {"week": week, "sow": sow, **dict(zip(POSITION, llh))}
-        row |= dict(zip(VELOCITY, velocity.get((week, sow), (np.nan,) * 3)))
         row |= dict.fromkeys(STD, np.nan) | dict(zip(STD[:3], (float(c[7]), float(c[8]), float(c[9]))))
-        rows.append(row | {"quality": _quality(c[1]) if c[0] == "SOL_COMPUTED" else 0})
-    return pd.DataFrame(rows)
+        rows.append(row | {"quality": _quality(c[1]) if c[0] == COMPUTED else 0})
+    at = np.array([week * units.WEEK_S + sow for week, sow, _ in positions])
+    velocities, late_s = _velocities(speeds, at)
+    return pd.DataFrame(rows).assign(**dict(zip(VELOCITY, velocities.T))), late_s
+
+
+def _velocities(speeds: Rows, at: np.ndarray) -> tuple[np.ndarray, float]:
+    """North, East, Down of the BESTVEL at GPS times ``at``, NaN where one is missing, and the largest latency [s].
+
+    A velocity is that of its stamp less its latency (OEM7 manual, BESTVEL): a Doppler is the mean over the interval
+    before.
+    """
+    known = [(week * units.WEEK_S + sow, *map(float, (c[2], *c[4:7]))) for week, sow, c in speeds if c[0] == COMPUTED]
+    if not known:
+        return np.full((len(at), 3), np.nan), 0.0
+    stamp, late, speed, course, up = np.array(known).T
+    t = stamp - late
+    order = np.argsort(t, kind="stable")
+    t, angle = t[order], np.radians(course[order])
+    v = np.stack((speed[order] * np.cos(angle), speed[order] * np.sin(angle), -up[order]), -1)
+    usual = float(np.median(np.diff(t))) if len(t) > 1 else 0.0
+    after = np.clip(np.searchsorted(t, at - EXACT_S), 0, len(t) - 1)
+    before = np.maximum(after - (t[after] > at + EXACT_S), 0)
+    exact = np.abs(t[after] - at) <= EXACT_S
+    between = (t[before] <= at) & (at <= t[after]) & (t[after] - t[before] <= LONGEST_STEP * usual)
+    along = np.stack([np.interp(at, t, one) for one in v.T], -1)
+    out = np.where(exact[:, None], v[after], np.where(between[:, None], along, np.nan))
+    return out, float(late.max())
 
 
 def _inspva(rows: list[tuple[int, float, list[str]]]) -> pd.DataFrame:

@@ -136,7 +136,8 @@ def _nav_sat_fix(m: Any) -> Row:
 
 
 def _stds(variances: np.ndarray) -> list[float]:
-    return np.sqrt(np.maximum(variances, 0.0)).tolist()
+    """Drivers write -1 for a covariance that they do not know (sensor_msgs)."""
+    return np.sqrt(np.where(variances >= 0, variances, np.nan)).tolist()
 
 
 def _twist(m: Any) -> Row:
