@@ -28,6 +28,7 @@ from dlkf.evaluation.table import (
     as_markdown,
     format_interval,
     format_number,
+    format_ratios,
     ratio_table,
     result_tables,
     slope_table,
@@ -99,6 +100,27 @@ def test_tables_hold_the_summarise_scores(scores):
     assert all(len(row) == len(t.columns) for t in (whole, outages) for row in t.rows)
     markdown = as_markdown(whole)
     assert markdown.count("\n| ") == 3 and "| mbkf15 |" in markdown
+
+
+def test_a_bound_of_a_ratio_reads_on_its_side_of_1():
+    """Whether 1 is in the interval is what a reader looks for."""
+    for bounds, said in (
+        ((0.9225, 0.8627, 1.0095), ["0.92", "0.86", "1.01"]),
+        ((0.9225, 0.8627, 1.0045), ["0.922", "0.863", "1.004"]),
+        ((0.98, 0.95, 0.9996), ["0.9800", "0.9500", "0.9996"]),
+        ((1.0, 0.012, 12.345), ["1.00", "0.012", "12.3"]),
+        ((math.nan, math.inf), ["–", "∞"]),
+    ):
+        assert format_ratios(*bounds) == said
+
+
+def test_the_recordings_of_a_ratio_are_those_that_have_it(scores):
+    """Fewer drives have an outage than a segment: then every column says of how many it is."""
+    part = replace(scores, outage=scores.outage & (np.arange(6) < 2)[:, None])
+    ratios = ratio_table("town", summarise_scores(part, resamples=50))
+    assert ratios.title.endswith("ratio to mbkf15")
+    counts = [column.rpartition("\n")[2] for column in ratios.columns[1:]]
+    assert counts == ["2 recordings"] * 2 + ["6 recordings"] * 3
 
 
 def test_kalman_filters_that_nobody_tuned_are_named_beside_a_learned_one():

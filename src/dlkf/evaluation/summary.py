@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 from dlkf.evaluation.bootstrap import MIN_GROUPS
 from dlkf.evaluation.results import Results
 from dlkf.evaluation.scores import Scores
-from dlkf.evaluation.table import DEGREES, format_number
+from dlkf.evaluation.table import DEGREES, format_number, format_ratios
 from dlkf.filters.build import is_filter
 from dlkf.filters.tuning import Tuning
 from dlkf.running.innovations import OF_NETWORK, REMEDY, fit_sigma
@@ -86,9 +86,7 @@ def describe_verdict(result: Results, name: str) -> str | None:
     baseline = result.baseline
     comparison = result.versus(name, *END, "geomean")
     if baseline is not None and comparison is not None:
-        ratio, low, high = (
-            format_number(x, digits=2) for x in (comparison.ratio, comparison.ratio_low, comparison.ratio_high)
-        )
+        ratio, low, high = format_ratios(comparison.ratio, comparison.ratio_low, comparison.ratio_high)
         if comparison.groups < MIN_GROUPS:
             direction = "worse" if comparison.ratio > 1 else "better"
             verdict = f"{ratio} by geometric mean: {direction}, but too few recordings for an interval"
