@@ -102,6 +102,26 @@ def test_tables_hold_the_summarise_scores(scores):
     assert markdown.count("\n| ") == 3 and "| mbkf15 |" in markdown
 
 
+def test_gnss_is_throughout_only_where_no_fix_lacks_for_long(cars):
+    """A gap of the drive's own is named, whether fixes are missing or not valid; what comes after the truth is none."""
+    valid, available, truth = cars.gnss_valid.clone(), cars.available.clone(), cars.truth_valid.clone()
+    valid[0, 20:32, :3] = False
+    available[1, 20:25] = False
+    available[2, 45:] = truth[2, 45:] = False
+    batch = replace(cars, gnss_valid=valid, available=available, truth_valid=truth)
+
+    def say(row):
+        one = score(FILTERS, [batch.select(torch.tensor([row]))])
+        return headline(summarise_scores(one, resamples=50))
+
+    assert say(0).startswith("With all fixes of the drives, at most 12 s without one: mbkf15 is ")
+    assert all(say(row).startswith("With GNSS throughout: mbkf15 is ") for row in (1, 2))
+    both = summarise_scores(score(FILTERS, [batch.select(torch.tensor([k])) for k in (0, 1)]), resamples=50)
+    assert both.count["longest_without_fix_s"] == 12.0
+    older = replace(both, count={k: v for k, v in both.count.items() if k != "longest_without_fix_s"})
+    assert headline(older).startswith("With all fixes of the drives: mbkf15 is ")
+
+
 def test_a_bound_of_a_ratio_reads_on_its_side_of_1():
     """Whether 1 is in the interval is what a reader looks for."""
     for bounds, said in (

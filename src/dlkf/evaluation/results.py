@@ -183,6 +183,7 @@ def summarise_scores(
             "outages": len(w.segment),
             "outage_drives": len({scores.segments[i].drive for i in w.segment}),
             "outage_s": [float(lengths.min()), float(lengths.max())] if len(lengths) else None,
+            "longest_without_fix_s": scores.longest_without_fix_s,
             "scored_s": float((~np.isnan(scores.truth_p_n[..., 0])).sum() * scores.epoch_s),
         },
         settle_s=settle_s,
