@@ -53,10 +53,16 @@ class EvaluationRun(NamedTuple):
     notes: Sequence[str] = ()
 
 
-def evaluate_dataset(settings: EvaluateSettings, console: Console) -> EvaluationRun:
-    """Load, run every model over the same scenes, score; messages on the way go to ``console``."""
+def evaluate_dataset(settings: EvaluateSettings, console: Console, typed: Sequence[str] = ()) -> EvaluationRun:
+    """Load, run every model over the same scenes, score; messages on the way go to ``console``.
+
+    ``typed``: what was typed of ``imu`` and ``tuning``.
+    """
     protocol, spec = settings.protocol(settings.align), settings.spec
     models = resolve_models(settings.models, spec, tracking_uri(settings.tracking.uri), **settings.filter_options)
+    unused = [unused_settings(model, typed) for model in settings.models]
+    if all(unused):  # beside a model that takes them nobody wonders
+        console.print("\n".join(unused), style="yellow", highlight=False, soft_wrap=True)
     check_baseline(settings.baseline, models)
     check_reference(settings.reference)
     chosen = choose_aids(settings.dataset, settings.aids, settings.drives)
@@ -121,10 +127,7 @@ def main(settings: EvaluateSettings) -> None:
     uri, name = tracking_uri(settings.tracking.uri), folder_name(settings.dataset)
     if settings.tracking.log:
         check_store(uri)
-    unused = [unused_settings(model, list_typed_words("imu", "tuning")) for model in settings.models]
-    if all(unused):  # beside a model that takes them nobody wonders
-        console.print("\n".join(unused), style="yellow", highlight=False, soft_wrap=True)
-    done = evaluate_dataset(settings, console)
+    done = evaluate_dataset(settings, console, list_typed_words("imu", "tuning"))
     results, segments = done.results, done.protocol["mode"] == "segments"
     write_report(
         settings.out, name, done.scores, results, protocol=done.protocol, by_time=segments, baseline=settings.baseline,
