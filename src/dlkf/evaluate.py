@@ -21,7 +21,7 @@ from dlkf.command.scored import EvaluateSettings
 from dlkf.data.kinds import drive_kinds
 from dlkf.data.store import choose_aids, dataset_digest, drive_rows
 from dlkf.evaluation.chunks import SHORT, EvaluationJob, evaluate_chunks
-from dlkf.evaluation.outages import UNUSED, check_outages, describe_unused
+from dlkf.evaluation.outages import UNUSED, check_outages, describe_rounding, describe_unused
 from dlkf.evaluation.protocol import REFUSED
 from dlkf.evaluation.results import Results
 from dlkf.evaluation.scores import Scores
@@ -79,7 +79,8 @@ def evaluate_dataset(settings: EvaluateSettings, console: Console, typed: Sequen
     rows, seen = select_scored_drives(cards, rows, name, digest, leave_out=settings.unseen)
     strange = domain_warnings(models, settings.dataset, [row.name for row in rows], spec.name, grid["rate_hz"])
     untuned = describe_untuned(models, settings.tuning, spec.name)
-    notes = [*seen, *strange, *([untuned] if untuned else [])]
+    rounded = describe_rounding(protocol.outage, step["epoch_s"])
+    notes = [*seen, *strange, *([untuned] if untuned else []), *([rounded] if rounded else [])]
     for line in notes:
         console.print(line, style="yellow")
     for line in describe_aids(models, chosen):

@@ -17,6 +17,7 @@ from dlkf.base.files import is_url, require_store
 from dlkf.command import command
 from dlkf.command.scored import TuneSettings
 from dlkf.data.store import choose_aids, dataset_digest, load_dataset
+from dlkf.evaluation.outages import describe_rounding
 from dlkf.evaluation.table import as_markdown, as_rich
 from dlkf.filters.aids.attach import append_aids, refuse_left_out
 from dlkf.filters.build import build_filter
@@ -40,6 +41,8 @@ def main(settings: TuneSettings) -> None:
         raise InputError(f"out={settings.out}: --config-dir takes folders of this machine alone; give one")
     require_store(settings.out)
     protocol, uri = settings.protocol(), tracking_uri(settings.tracking.uri)
+    if rounded := describe_rounding(protocol.outage, settings.epoch_s):
+        print(rounded)
     with show_progress("Loading drives") as progress:
         drives = load_dataset(
             settings.dataset,
