@@ -26,7 +26,7 @@ from dlkf.evaluation.protocol import REFUSED
 from dlkf.evaluation.results import Results
 from dlkf.evaluation.scores import Scores
 from dlkf.evaluation.sensors import sensor_table
-from dlkf.evaluation.study import make_results
+from dlkf.evaluation.study import choose_baseline, make_results
 from dlkf.evaluation.summary import FEW, collect_metrics, describe_untuned, headline, sigma_warnings
 from dlkf.evaluation.table import ResultTable, all_tables, as_markdown, as_rich, result_tables
 from dlkf.filters.aids.attach import aid_columns, describe_aids, find_tables, refuse_left_out, with_aids
@@ -37,18 +37,19 @@ from dlkf.report.evaluation import write_report
 from dlkf.running.offline import SAMPLES_AT_ONCE, UsableFixes, chunk_drives
 from dlkf.running.references import check_reference
 from dlkf.tracking.grid import start_point
-from dlkf.tracking.models import check_baseline, resolve_models, unused_settings
+from dlkf.tracking.models import resolve_models, unused_settings
 from dlkf.tracking.runs import check_store, tracking_uri
 
 
 class EvaluationRun(NamedTuple):
-    """Scores of an evaluation, its results per kind of data, how it was done, on which data, and what was said of
-    drives and filters."""
+    """Scores of an evaluation, its results per kind of data, how it was done, on which data, against which filter, and
+    what was said of drives and filters."""
 
     scores: Scores
     results: list[Results]
     protocol: Mapping[str, Any]
     digest: str
+    baseline: str
     sensors: ResultTable | None = None
     notes: Sequence[str] = ()
 
@@ -63,7 +64,7 @@ def evaluate_dataset(settings: EvaluateSettings, console: Console, typed: Sequen
     unused = [unused_settings(model, typed) for model in settings.models]
     if all(unused):  # beside a model that takes them nobody wonders
         console.print("\n".join(unused), style="yellow", highlight=False, soft_wrap=True)
-    check_baseline(settings.baseline, models)
+    baseline = choose_baseline(settings.baseline, models)
     check_reference(settings.reference)
     chosen = choose_aids(settings.dataset, settings.aids, settings.drives)
     if settings.aids is not None:
@@ -80,7 +81,8 @@ def evaluate_dataset(settings: EvaluateSettings, console: Console, typed: Sequen
     strange = domain_warnings(models, settings.dataset, [row.name for row in rows], spec.name, grid["rate_hz"])
     untuned = describe_untuned(models, settings.tuning, spec.name)
     rounded = describe_rounding(protocol.outage, step["epoch_s"])
-    notes = [*seen, *strange, *([untuned] if untuned else []), *([rounded] if rounded else [])]
+    unlike = f"no ratios: baseline={baseline} is not among the models" if baseline not in models else ""
+    notes = [*seen, *strange, *filter(None, (untuned, rounded, unlike))]
     for line in notes:
         console.print(line, style="yellow")
     for line in describe_aids(models, chosen):
@@ -110,14 +112,14 @@ def evaluate_dataset(settings: EvaluateSettings, console: Console, typed: Sequen
     if protocol.outage and (unused := describe_unused(protocol.outage, scores.outage, *scores.ends)):
         console.print(unused, style="yellow", highlight=False)
         done.rules[UNUSED] = unused
-    results = make_results(scores, baseline=settings.baseline, settle_s=settings.settle_s, seed=settings.seed)
+    results = make_results(scores, baseline=baseline, settle_s=settings.settle_s, seed=settings.seed)
     made_how = {
         **describe_provenance(), "models": settings.model, "dataset": settings.dataset, "imu": spec.name,
         "tuning": asdict(settings.tuning), "imu values": {"accel": asdict(spec.accel), "gyro": asdict(spec.gyro)},
         "digest": digest, **done.truth, **step, **done.rules, "aids": [table.name for table in taken],
     }  # fmt: skip
     sensors = sensor_table(scores, {model_name: aid_columns(model) for model_name, model in models.items()})
-    return EvaluationRun(scores, results, made_how, digest, sensors, notes)
+    return EvaluationRun(scores, results, made_how, digest, baseline, sensors, notes)
 
 
 @command("evaluate", EvaluateSettings)
@@ -131,7 +133,7 @@ def main(settings: EvaluateSettings) -> None:
     done = evaluate_dataset(settings, console, list_typed_words("imu", "tuning"))
     results, segments = done.results, done.protocol["mode"] == "segments"
     write_report(
-        settings.out, name, done.scores, results, protocol=done.protocol, by_time=segments, baseline=settings.baseline,
+        settings.out, name, done.scores, results, protocol=done.protocol, by_time=segments, baseline=done.baseline,
         more=[done.sensors] if done.sensors else (), figures=settings.figures,
     )  # fmt: skip
     for result in results:
