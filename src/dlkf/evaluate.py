@@ -20,7 +20,7 @@ from dlkf.command import command, list_typed_words
 from dlkf.command.scored import EvaluateSettings
 from dlkf.data.kinds import drive_kinds
 from dlkf.data.store import choose_aids, dataset_digest, drive_rows
-from dlkf.evaluation.chunks import SHORT, EvaluationJob, evaluate_chunks
+from dlkf.evaluation.chunks import SHORT, EvaluationJob, evaluate_chunks, suggest_more_outages
 from dlkf.evaluation.outages import UNUSED, check_outages, describe_rounding, describe_unused
 from dlkf.evaluation.protocol import REFUSED
 from dlkf.evaluation.results import Results
@@ -43,7 +43,7 @@ from dlkf.tracking.runs import check_store, tracking_uri
 
 class EvaluationRun(NamedTuple):
     """Scores of an evaluation, its results per kind of data, how it was done, on which data, against which filter, and
-    what was said of drives and filters."""
+    what was said of drives and filters; advice on few outages."""
 
     scores: Scores
     results: list[Results]
@@ -52,6 +52,7 @@ class EvaluationRun(NamedTuple):
     baseline: str
     sensors: ResultTable | None = None
     notes: Sequence[str] = ()
+    advice: str = ""
 
 
 def evaluate_dataset(settings: EvaluateSettings, console: Console, typed: Sequence[str] = ()) -> EvaluationRun:
@@ -95,7 +96,8 @@ def evaluate_dataset(settings: EvaluateSettings, console: Console, typed: Sequen
     )  # fmt: skip
     fixes = {row.name: UsableFixes.of(settings.dataset, row.name) for row in rows}
     many = SAMPLES_AT_ONCE if settings.parallel is None else SAMPLES_AT_ONCE // 4
-    done = evaluate_chunks(work, chunk_drives(fixes, grid["rate_hz"], many), settings.parallel)
+    chunks = chunk_drives(fixes, grid["rate_hz"], many)
+    done = evaluate_chunks(work, chunks, settings.parallel)
     for reason in done.rules["skipped"].values():
         console.print(f"left out: {reason}", style="yellow")
     for drive, said in done.rules.get(REFUSED, {}).items():
@@ -119,7 +121,10 @@ def evaluate_dataset(settings: EvaluateSettings, console: Console, typed: Sequen
         "digest": digest, **done.truth, **step, **done.rules, "aids": [table.name for table in taken],
     }  # fmt: skip
     sensors = sensor_table(scores, {model_name: aid_columns(model) for model_name, model in models.items()})
-    return EvaluationRun(scores, results, made_how, digest, baseline, sensors, notes)
+    of_kinds, advice = [int(r.count["outages"]) for r in results], ""
+    if done.rules["mode"] == "segments" and any(0 < n < FEW for n in of_kinds):
+        advice = suggest_more_outages(work, chunks, sum(of_kinds), settings.parallel)
+    return EvaluationRun(scores, results, made_how, digest, baseline, sensors, notes, advice)
 
 
 @command("evaluate", EvaluateSettings)
@@ -141,8 +146,8 @@ def main(settings: EvaluateSettings) -> None:
         console.print(f"[bold]{headline(result)}[/bold]", highlight=False)
     for line in sigma_warnings(done.scores):
         console.print(line, style="yellow", highlight=False, soft_wrap=True)
-    if segments and any(0 < int(r.count.get("outages") or 0) < FEW for r in results):
-        console.print("Few outages; mode=drives scores whole drives, with about twice as many.", style="yellow")
+    if done.advice:
+        console.print(done.advice, style="yellow", highlight=False, soft_wrap=True)
     save_log(console, settings.out)
     kept = ""
     if settings.tracking.log:
