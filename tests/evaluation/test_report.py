@@ -134,6 +134,16 @@ def test_a_bound_of_a_ratio_reads_on_its_side_of_1():
         assert format_ratios(*bounds) == said
 
 
+def test_drift_says_of_how_many_outages_it_is(scores):
+    """A car that stands has no error per distance; a reference that begins just after the last fix takes none away."""
+    truth = scores.truth_v_n.copy()
+    truth[0], truth[1, 29] = 0.0, np.nan
+    (_, table), (_, before) = (
+        result_tables("town", summarise_scores(s, resamples=50)) for s in (replace(scores, truth_v_n=truth), scores)
+    )
+    assert "(median over the 5 outages of more than 1 m)" in table.note and "(median)" in before.note
+
+
 def test_the_recordings_of_a_ratio_are_those_that_have_it(scores):
     """Fewer drives have an outage than a segment: then every column says of how many it is."""
     part = replace(scores, outage=scores.outage & (np.arange(6) < 2)[:, None])

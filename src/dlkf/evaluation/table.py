@@ -19,7 +19,7 @@ from rich.table import Table as RichTable
 from rich.text import Text
 
 from dlkf.evaluation.bootstrap import MIN_GROUPS, Comparison
-from dlkf.evaluation.results import IMU_AXES, Results, Value
+from dlkf.evaluation.results import IMU_AXES, LEAST_M, Results, Value
 
 DASH = "–"
 DEGREES = 180 / math.pi
@@ -113,11 +113,14 @@ def outage_table(what: str, result: Results) -> ResultTable:
     n, low, high = result.count, *result.count["outage_s"]
     length = f"{low:g} s" if low == high else f"{low:g} to {high:g} s"
     at = [s for s in result.seconds_into_outage() if float(s) < high][-2:]
+    driven = int(max(result.value(name, "outages", "end", "drift", "n") for name in result.filters))
+    of_some = f" over the {_count(driven, 'outage')} of more than {LEAST_M:g} m" if driven < n["outages"] else ""
     table = ResultTable(
         title=f"{what}: {_count(n['outages'], 'outage')} of {length}, {_count(n['outage_drives'], 'drive')}",
         note="Horizontal error at the end (RMS, median, 95 % over the outages), at times into it (RMS); velocity and "
-        "attitude at the end (RMS); drift: horizontal error per distance driven (median); own 1σ: what the filter says "
-        "of its horizontal error at the end (median); innov. / σ: innovations over the 1σ that it expects (RMS).",
+        f"attitude at the end (RMS); drift: horizontal error per distance driven (median{of_some}); own 1σ: what the "
+        "filter says of its horizontal error at the end (median); innov. / σ: innovations over the 1σ that it expects "
+        "(RMS).",
         columns=["Filter", "End, RMS\n[m]", "median\n[m]", "95 %\n[m]"]
         + [f"RMS\n{s} s\n[m]" for s in at]
         + ["Velocity\n[m/s]", "Attitude\n[°]", "Drift\n[%]", "Own 1σ\n[m]", "Innov.\n/ σ"],
