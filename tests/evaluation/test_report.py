@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from matplotlib.colors import to_rgb
 
 from dlkf.base.errors import InputError
 from dlkf.base.files import write_into
@@ -37,6 +38,7 @@ from dlkf.filters.build import build_filter
 from dlkf.filters.tuning import Tuning
 from dlkf.report.compare import StoredReport, describe_tests, end_table, mark_best_of_each, shorten_names
 from dlkf.report.evaluation import describe_average, evaluation_page, least_error, outage_rows, write_report
+from dlkf.report.page import format_setting
 from dlkf.report.training import learning_curve
 from tests.cars import IMU
 from tests.evaluation.drawn import figures_of
@@ -232,6 +234,25 @@ def test_figures_have_content(scores, draw):
     data = png(figure, dpi=40)
     assert data.startswith(b"\x89PNG") and len(data) > 5000
     assert all(ax.get_xlabel() or ax.get_shared_x_axes() for ax in figure.axes)
+
+
+def test_figures_say_what_is_drawn_in_which_colour(scores):
+    """A histogram names the filters that it has, and counts in whole outages; a band has no filter's colour."""
+    names = list(scores.filters)
+    both, one = (figures.error_histograms(scores, drawn) for drawn in (names, names[-1:]))
+    assert both.get_suptitle() == "" and one.get_suptitle() == f"1 of {len(names)} filters: {names[-1]}"
+    for figure in (both, one):
+        assert all(tick == round(tick) for ax in figure.axes if ax.get_visible() for tick in ax.get_yticks())
+    legend = figures.imu_errors(scores, 1).legends[0]
+    patches = {t.get_text(): patch for t, patch in zip(legend.get_texts(), legend.legend_handles)}
+    colours = [to_rgb(patches[name].get_color()) for name in patches if name in names]
+    band = to_rgb(patches["±3σ, in the colour of each filter"].get_facecolor())
+    assert colours and len(set(band)) == 1 and band not in colours
+
+
+def test_an_empty_list_is_none_and_not_unknown():
+    """``aids=[]`` beside ``aids=[speed]``."""
+    assert [format_setting(x) for x in ([], ["speed", "baro"], None, {})] == ["none", "speed, baro", "–", "–"]
 
 
 @pytest.mark.whole
