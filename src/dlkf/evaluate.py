@@ -30,8 +30,8 @@ from dlkf.evaluation.study import choose_baseline, make_results
 from dlkf.evaluation.summary import FEW, collect_metrics, describe_untuned, headline, sigma_warnings
 from dlkf.evaluation.table import ResultTable, all_tables, as_markdown, as_rich, result_tables
 from dlkf.filters.aids.attach import aid_columns, describe_aids, find_tables, refuse_left_out, with_aids
-from dlkf.filters.build import build_filter
-from dlkf.filters.card import domain_warnings, select_scored_drives
+from dlkf.filters.build import build_filter, is_filter
+from dlkf.filters.card import card_of_tuning, domain_warnings, select_scored_drives
 from dlkf.filters.saved import choose_grid
 from dlkf.report.evaluation import write_report
 from dlkf.running.offline import SAMPLES_AT_ONCE, UsableFixes, chunk_drives
@@ -78,6 +78,8 @@ def evaluate_dataset(settings: EvaluateSettings, console: Console, typed: Sequen
     rows, name = drive_rows(settings.dataset, settings.drives), folder_name(settings.dataset)
     digest, kinds = dataset_digest(settings.dataset), drive_kinds(settings.dataset)
     cards = {model_name: getattr(model, "card", {}) for model_name, model in models.items()}
+    kalman = [model_name for model_name in models if is_filter(model_name) and model_name != "ins"]
+    cards |= card_of_tuning(kalman, settings.tuning)
     rows, seen = select_scored_drives(cards, rows, name, digest, leave_out=settings.unseen)
     strange = domain_warnings(models, settings.dataset, [row.name for row in rows], spec.name, grid["rate_hz"])
     untuned = describe_untuned(models, settings.tuning, spec.name)
@@ -117,7 +119,7 @@ def evaluate_dataset(settings: EvaluateSettings, console: Console, typed: Sequen
     results = make_results(scores, baseline=baseline, settle_s=settings.settle_s, seed=settings.seed)
     made_how = {
         **describe_provenance(), "models": settings.model, "dataset": settings.dataset, "imu": spec.name,
-        "tuning": asdict(settings.tuning), "imu values": {"accel": asdict(spec.accel), "gyro": asdict(spec.gyro)},
+        "tuning": settings.tuning.factors(), "imu values": {"accel": asdict(spec.accel), "gyro": asdict(spec.gyro)},
         "digest": digest, **done.truth, **step, **done.rules, "aids": [table.name for table in taken],
     }  # fmt: skip
     sensors = sensor_table(scores, {model_name: aid_columns(model) for model_name, model in models.items()})
