@@ -191,7 +191,8 @@ def outage_distance(v_truth: Array, w: OutageIntervals, epoch_s: float) -> Array
     """
     speed = np.hypot(v_truth[..., 0], v_truth[..., 1])
     before = np.concatenate((speed[:, :1], speed[:, :-1]), -1)
-    step = 0.5 * (speed + np.where(np.isnan(before), speed, before)) * epoch_s
+    before = np.where(np.isnan(before), speed, before)
+    step = 0.5 * (speed + before) * epoch_s
     cumulative = np.concatenate((np.zeros((len(step), 1)), np.cumsum(np.nan_to_num(step), -1)), -1)
     missing = np.concatenate((np.zeros((len(step), 1)), np.cumsum(np.isnan(step), -1)), -1)
     gaps = missing[w.segment, w.last + 1] - missing[w.segment, w.first]
