@@ -20,44 +20,52 @@ from dlkf.command import command, list_typed_words
 from dlkf.command.scored import EvaluateSettings
 from dlkf.data.kinds import drive_kinds
 from dlkf.data.store import choose_aids, dataset_digest, drive_rows
-from dlkf.evaluation.chunks import SHORT, EvaluationJob, evaluate_chunks
-from dlkf.evaluation.outages import UNUSED, check_outages, describe_unused
+from dlkf.evaluation.chunks import SHORT, EvaluationJob, evaluate_chunks, suggest_more_outages
+from dlkf.evaluation.outages import UNUSED, check_outages, describe_rounding, describe_unused
 from dlkf.evaluation.protocol import REFUSED
 from dlkf.evaluation.results import Results
 from dlkf.evaluation.scores import Scores
 from dlkf.evaluation.sensors import sensor_table
-from dlkf.evaluation.study import make_results
+from dlkf.evaluation.study import choose_baseline, make_results
 from dlkf.evaluation.summary import FEW, collect_metrics, describe_untuned, headline, sigma_warnings
 from dlkf.evaluation.table import ResultTable, all_tables, as_markdown, as_rich, result_tables
 from dlkf.filters.aids.attach import aid_columns, describe_aids, find_tables, refuse_left_out, with_aids
-from dlkf.filters.build import build_filter
-from dlkf.filters.card import domain_warnings, select_scored_drives
+from dlkf.filters.build import build_filter, is_filter
+from dlkf.filters.card import card_of_tuning, domain_warnings, select_scored_drives
 from dlkf.filters.saved import choose_grid
 from dlkf.report.evaluation import write_report
 from dlkf.running.offline import SAMPLES_AT_ONCE, UsableFixes, chunk_drives
 from dlkf.running.references import check_reference
 from dlkf.tracking.grid import start_point
-from dlkf.tracking.models import check_baseline, resolve_models, unused_settings
+from dlkf.tracking.models import resolve_models, unused_settings
 from dlkf.tracking.runs import check_store, tracking_uri
 
 
 class EvaluationRun(NamedTuple):
-    """Scores of an evaluation, its results per kind of data, how it was done, on which data, and what was said of
-    drives and filters."""
+    """Scores of an evaluation, its results per kind of data, how it was done, on which data, against which filter, and
+    what was said of drives and filters; advice on few outages."""
 
     scores: Scores
     results: list[Results]
     protocol: Mapping[str, Any]
     digest: str
+    baseline: str
     sensors: ResultTable | None = None
     notes: Sequence[str] = ()
+    advice: str = ""
 
 
-def evaluate_dataset(settings: EvaluateSettings, console: Console) -> EvaluationRun:
-    """Load, run every model over the same scenes, score; messages on the way go to ``console``."""
+def evaluate_dataset(settings: EvaluateSettings, console: Console, typed: Sequence[str] = ()) -> EvaluationRun:
+    """Load, run every model over the same scenes, score; messages on the way go to ``console``.
+
+    ``typed``: what was typed of ``imu`` and ``tuning``.
+    """
     protocol, spec = settings.protocol(settings.align), settings.spec
     models = resolve_models(settings.models, spec, tracking_uri(settings.tracking.uri), **settings.filter_options)
-    check_baseline(settings.baseline, models)
+    unused = [unused_settings(model, typed) for model in settings.models]
+    if all(unused):  # beside a model that takes them nobody wonders
+        console.print("\n".join(unused), style="yellow", highlight=False, soft_wrap=True)
+    baseline = choose_baseline(settings.baseline, models)
     check_reference(settings.reference)
     chosen = choose_aids(settings.dataset, settings.aids, settings.drives)
     if settings.aids is not None:
@@ -70,10 +78,14 @@ def evaluate_dataset(settings: EvaluateSettings, console: Console) -> Evaluation
     rows, name = drive_rows(settings.dataset, settings.drives), folder_name(settings.dataset)
     digest, kinds = dataset_digest(settings.dataset), drive_kinds(settings.dataset)
     cards = {model_name: getattr(model, "card", {}) for model_name, model in models.items()}
+    kalman = [model_name for model_name in models if is_filter(model_name) and model_name != "ins"]
+    cards |= card_of_tuning(kalman, settings.tuning)
     rows, seen = select_scored_drives(cards, rows, name, digest, leave_out=settings.unseen)
     strange = domain_warnings(models, settings.dataset, [row.name for row in rows], spec.name, grid["rate_hz"])
     untuned = describe_untuned(models, settings.tuning, spec.name)
-    notes = [*seen, *strange, *([untuned] if untuned else [])]
+    rounded = describe_rounding(protocol.outage, step["epoch_s"])
+    unlike = f"no ratios: baseline={baseline} is not among the models" if baseline not in models else ""
+    notes = [*seen, *strange, *filter(None, (untuned, rounded, unlike))]
     for line in notes:
         console.print(line, style="yellow")
     for line in describe_aids(models, chosen):
@@ -86,7 +98,8 @@ def evaluate_dataset(settings: EvaluateSettings, console: Console) -> Evaluation
     )  # fmt: skip
     fixes = {row.name: UsableFixes.of(settings.dataset, row.name) for row in rows}
     many = SAMPLES_AT_ONCE if settings.parallel is None else SAMPLES_AT_ONCE // 4
-    done = evaluate_chunks(work, chunk_drives(fixes, grid["rate_hz"], many), settings.parallel)
+    chunks = chunk_drives(fixes, grid["rate_hz"], many)
+    done = evaluate_chunks(work, chunks, settings.parallel)
     for reason in done.rules["skipped"].values():
         console.print(f"left out: {reason}", style="yellow")
     for drive, said in done.rules.get(REFUSED, {}).items():
@@ -103,14 +116,17 @@ def evaluate_dataset(settings: EvaluateSettings, console: Console) -> Evaluation
     if protocol.outage and (unused := describe_unused(protocol.outage, scores.outage, *scores.ends)):
         console.print(unused, style="yellow", highlight=False)
         done.rules[UNUSED] = unused
-    results = make_results(scores, baseline=settings.baseline, settle_s=settings.settle_s, seed=settings.seed)
+    results = make_results(scores, baseline=baseline, settle_s=settings.settle_s, seed=settings.seed)
     made_how = {
         **describe_provenance(), "models": settings.model, "dataset": settings.dataset, "imu": spec.name,
-        "tuning": asdict(settings.tuning), "imu values": {"accel": asdict(spec.accel), "gyro": asdict(spec.gyro)},
+        "tuning": settings.tuning.factors(), "imu values": {"accel": asdict(spec.accel), "gyro": asdict(spec.gyro)},
         "digest": digest, **done.truth, **step, **done.rules, "aids": [table.name for table in taken],
     }  # fmt: skip
     sensors = sensor_table(scores, {model_name: aid_columns(model) for model_name, model in models.items()})
-    return EvaluationRun(scores, results, made_how, digest, sensors, notes)
+    of_kinds, advice = [int(r.count["outages"]) for r in results], ""
+    if done.rules["mode"] == "segments" and any(0 < n < FEW for n in of_kinds):
+        advice = suggest_more_outages(work, chunks, sum(of_kinds), settings.parallel)
+    return EvaluationRun(scores, results, made_how, digest, baseline, sensors, notes, advice)
 
 
 @command("evaluate", EvaluateSettings)
@@ -121,13 +137,10 @@ def main(settings: EvaluateSettings) -> None:
     uri, name = tracking_uri(settings.tracking.uri), folder_name(settings.dataset)
     if settings.tracking.log:
         check_store(uri)
-    unused = [unused_settings(model, list_typed_words("imu", "tuning")) for model in settings.models]
-    if all(unused):  # beside a model that takes them nobody wonders
-        console.print("\n".join(unused), style="yellow", highlight=False, soft_wrap=True)
-    done = evaluate_dataset(settings, console)
+    done = evaluate_dataset(settings, console, list_typed_words("imu", "tuning"))
     results, segments = done.results, done.protocol["mode"] == "segments"
     write_report(
-        settings.out, name, done.scores, results, protocol=done.protocol, by_time=segments, baseline=settings.baseline,
+        settings.out, name, done.scores, results, protocol=done.protocol, by_time=segments, baseline=done.baseline,
         more=[done.sensors] if done.sensors else (), figures=settings.figures,
     )  # fmt: skip
     for result in results:
@@ -135,8 +148,8 @@ def main(settings: EvaluateSettings) -> None:
         console.print(f"[bold]{headline(result)}[/bold]", highlight=False)
     for line in sigma_warnings(done.scores):
         console.print(line, style="yellow", highlight=False, soft_wrap=True)
-    if segments and any(0 < int(r.count.get("outages") or 0) < FEW for r in results):
-        console.print("Few outages; mode=drives scores whole drives, with about twice as many.", style="yellow")
+    if done.advice:
+        console.print(done.advice, style="yellow", highlight=False, soft_wrap=True)
     save_log(console, settings.out)
     kept = ""
     if settings.tracking.log:

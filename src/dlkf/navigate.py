@@ -114,7 +114,7 @@ def main(settings: NavigateSettings) -> None:
         made = {
             **describe_provenance(), "model": settings.model, "dataset": settings.dataset, "drives": settings.drives,
             **step, "aids": [table.name for table in grid["aids"]], "digest": dataset_digest(settings.dataset),
-            "imu": asdict(spec), "tuning": asdict(tuning),
+            "imu": asdict(spec), "tuning": tuning.factors(),
         }  # fmt: skip
         remedy = REMEDY if takes_tuning(settings.model) else OF_NETWORK
         doubt = offline.sigma_warning((course.result for course in courses), name, remedy)

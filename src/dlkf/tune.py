@@ -1,7 +1,7 @@
 """Tune a Kalman filter: ``python -m dlkf.tune model=mbkf21 dataset=data/per_drive name=town out=mine``.
 
-Writes ``out/tuning/<name>.yaml``, which evaluate and navigate take with ``--config-dir <out> tuning=<name>``, and
-logs the search to MLflow.
+Writes ``out/tuning/<name>.yaml``, which evaluate and navigate take with ``--config-dir <out> tuning=<name>``, with the
+recordings that it was fitted on, and logs the search to MLflow.
 """
 
 from __future__ import annotations
@@ -13,13 +13,15 @@ import torch
 
 from dlkf.base.console import make_console, show_progress
 from dlkf.base.errors import InputError
-from dlkf.base.files import is_url, require_store
+from dlkf.base.files import folder_name, is_url, require_store
 from dlkf.command import command
 from dlkf.command.scored import TuneSettings
 from dlkf.data.store import choose_aids, dataset_digest, load_dataset
+from dlkf.evaluation.outages import describe_rounding
 from dlkf.evaluation.table import as_markdown, as_rich
 from dlkf.filters.aids.attach import append_aids, refuse_left_out
 from dlkf.filters.build import build_filter
+from dlkf.filters.tuning import FittedOn
 from dlkf.onboard.compiled_filter import compile_or_keep
 from dlkf.running.likelihood import Evidence, find_noise
 from dlkf.tracking.runs import start_run, tracking_uri
@@ -40,6 +42,8 @@ def main(settings: TuneSettings) -> None:
         raise InputError(f"out={settings.out}: --config-dir takes folders of this machine alone; give one")
     require_store(settings.out)
     protocol, uri = settings.protocol(), tracking_uri(settings.tracking.uri)
+    if rounded := describe_rounding(protocol.outage, settings.epoch_s):
+        print(rounded)
     with show_progress("Loading drives") as progress:
         drives = load_dataset(
             settings.dataset,
@@ -57,13 +61,16 @@ def main(settings: TuneSettings) -> None:
         parts = train_test_drives(drives, settings.split, settings.fractions, settings.split_seed, protocol.length_s)
     with start_run(uri, "tune", f"{model} {dataset}") as run:
         run.log_config(asdict(settings))
-        run.log_dataset(settings.dataset, dataset_digest(settings.dataset), "tuning")
+        digest = dataset_digest(settings.dataset)
+        run.log_dataset(settings.dataset, digest, "tuning")
+        recordings = sorted({drive.group for drive in parts.get("train", drives)})
+        fitted_on = FittedOn(folder_name(settings.dataset), digest, recordings)
         if settings.objective == LIKELIHOOD:
             evidence = Evidence.of(drives, settings.minutes)
             with show_progress(f"Noise for {model}") as bar:
                 found = find_noise(evidence, model, spec, start, called=name, progress=bar, compiler=compile_or_keep)
             table = noise_table(model, dataset, spec, start, found)
-            files = write_noise(out, found, table)
+            files = write_noise(out, found, table, fitted_on)
             run.log_metrics({f"found/{k}": v for k, v in found.describe().items()})
         else:
             result = search(
@@ -78,7 +85,7 @@ def main(settings: TuneSettings) -> None:
                 prior=settings.filter_options["prior"],
             )
             table = tuning_table(result, dataset)
-            files = write_tuning(out, name, result, table)
+            files = write_tuning(out, name, result, table, fitted_on)
             run.log_metrics(result.metrics())
             run.log_metrics({f"tuned/{k}": v for k, v in result.changed.items()})
         for file in files:

@@ -8,7 +8,7 @@ from typing import Literal
 
 import pytest
 
-from dlkf.base.errors import InputError
+from dlkf.base.errors import InputError, did_you_mean
 from dlkf.base.settings import Ranged, bounded_field, settings_from
 
 
@@ -101,3 +101,13 @@ def test_what_is_out_of_range_has_one_text(given, expected):
 def test_the_whole_of_a_command_has_its_own_text_for_an_unknown_key():
     with pytest.raises(InputError, match="unknown config key 'lenght_s'; --cfg job"):
         settings_from(Outer, {"name": "x", "lenght_s": 1}, "")
+
+
+@pytest.mark.parametrize(
+    ("name", "meant"),
+    [("modle", "model"), ("Modle", "model"), ("dirves", "drives"), ("modes", "mode"), ("mod", "mode"), ("zzz", "")],
+)
+def test_two_neighbours_that_are_swapped_are_the_closest(name, meant):
+    """``modle`` has four letters of ``mode`` in order, and all five of ``model``."""
+    said = did_you_mean(name, ["mode", "model", "drives"])
+    assert said == (f"; did you mean {meant}?" if meant else "")

@@ -2,14 +2,39 @@
 
 import json
 import shutil
+from dataclasses import replace
 
 import pandas as pd
 import pyarrow.parquet as pq
 import pytest
 
 from dlkf.data.schema import drive_file
+from dlkf.data.store import drive_rows
+from dlkf.evaluation.chunks import EvaluationJob, evaluate_chunks, suggest_more_outages
+from dlkf.evaluation.outages import OutagePlan
+from dlkf.evaluation.protocol import Protocol
+from dlkf.filters.build import build_filter
 from dlkf.running.solution import GEO_SCHEMA
+from tests.cars import IMU
 from tests.shell import PATIENCE_S, start_command
+
+
+@pytest.mark.parametrize("duration_s, said", [(5, "has"), (30, "has no more")])
+def test_few_outages_are_compared_with_those_of_whole_drives(town, duration_s, said):
+    """The number is that of the run that is suggested, or there is no suggestion."""
+    filters, grid = {"ins": build_filter("ins", IMU)}, {"rate_hz": 20.0, "epoch_s": 1.0, "aids": ()}
+    protocol = Protocol("segments", 50.0, 50.0, outage=OutagePlan(15, duration_s))
+    names = [row.name for row in drive_rows(town)]
+    kinds = dict.fromkeys(names, "simulated")
+    work = EvaluationJob(str(town), filters, protocol, grid, kinds, {}, shown=False)
+    chunks = [tuple(names[:2]), tuple(names[2:])]
+    counts = []
+    for mode in ("segments", "drives"):
+        done = evaluate_chunks(replace(work, protocol=replace(protocol, mode=mode)), chunks)
+        counts.append(len(done.scores.windows.segment))
+    assert (counts[1] > counts[0]) == (said == "has")
+    advice = suggest_more_outages(work, chunks, counts[0])
+    assert str(counts[0]) in advice and f" {said} " in advice and str(counts[1]) in advice
 
 
 @pytest.fixture
@@ -64,10 +89,11 @@ def test_navigate_writes_solutions_without_a_reference(call, tmp_path):
         ("navigate", ["model=mbkf99"], "unknown model 'mbkf99'"),
         ("navigate", ["model=mbkf15", "imu=none_such"], "none_such"),
         ("evaluate", ["model=mbkf15", "tuning.gyro_noise=-1.0"], "tuning: gyro_noise is -1.0"),
+        ("evaluate", ["model=mbkf99", "imu=consumer"], "unknown model 'mbkf99'"),  # nothing is said of its noise
     ],
 )
 def test_a_mistake_is_one_line_and_leaves_nothing(town, call, tmp_path, command, arguments, said):
     done = call(command, *arguments, f"dataset={town}", "out=made", "rate_hz=20")
     assert done.code == 2
-    assert len(done.err.strip().splitlines()) == 1 and said in done.err
+    assert len(done.err.strip().splitlines()) == 1 and said in done.err and not done.out
     assert not (tmp_path / "made").exists()

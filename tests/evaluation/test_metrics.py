@@ -117,6 +117,7 @@ def test_distance_in_an_outage_at_constant_speed():
     v[..., 0], v[..., 1], v[..., 2] = 6.0, 8.0, 99.0  # 10 m/s over ground, whatever it does vertically
     outage = np.zeros((2, 30), bool)
     outage[:, 5:20] = True
+    v[0, 4] = np.nan  # at the start of the outage: the speed a second later stands for it
     v[1, 7] = np.nan
     distance = m.outage_distance(v, m.outage_intervals(outage), epoch_s=1.0)
     assert distance[0] == pytest.approx(150.0) and math.isnan(distance[1])

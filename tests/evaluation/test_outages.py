@@ -9,7 +9,7 @@ import torch
 from dlkf.base.errors import InputError
 from dlkf.data.masks import withhold_fixes
 from dlkf.evaluation.metrics import outage_intervals
-from dlkf.evaluation.outages import OutagePlan, describe_unused, scorable_outages
+from dlkf.evaluation.outages import OutagePlan, describe_rounding, describe_unused, scorable_outages
 
 
 def _windows(mask):
@@ -30,6 +30,24 @@ def test_times_are_seconds_whatever_an_epoch_lasts(cars):
     (mask,) = OutagePlan(first_s=20, duration_s=10).masks(half)
     assert _windows(mask)[0] == (0, 40, 20)
     assert not OutagePlan(first_s=21, duration_s=10).masks(half)[0].any()
+
+
+def test_times_that_are_no_whole_epochs_are_rounded_and_said(cars):
+    """Outages are as the rounded plan has them, in every repetition; a plan of whole epochs stays as it is."""
+    plan = OutagePlan(first_s=3.5, duration_s=[6.4, 6.4], every_s=17.3, offsets_s=[0.5])
+    rounded = plan.in_whole_epochs(1.0)
+    assert rounded == OutagePlan(first_s=3.0, duration_s=[6.0, 6.0], every_s=17.0, offsets_s=[0.0])
+    assert describe_rounding(plan, 1.0) == (
+        "rounded to whole epochs of 1 s: outage.first_s=3, outage.duration_s=[6,6], outage.every_s=17, "
+        "outage.offsets_s=[0]"
+    )
+    (mask,) = rounded.masks(cars)
+    assert _windows(mask)[:4] == [(0, 3, 6), (0, 20, 6), (0, 37, 6), (0, 54, 6)]
+    assert OutagePlan(30.5, 21.4).in_whole_epochs(1.0) == OutagePlan(30.0, 21.0)
+    assert OutagePlan(30.5, 0.2).in_whole_epochs(0.5) == OutagePlan(30.5, 0.5)
+    for same in (plan, OutagePlan((10.0, 25.0), 30)):
+        assert same.in_whole_epochs(0.1) == same and describe_rounding(same, 0.1) == ""
+    assert describe_rounding(None, 1.0) == ""
 
 
 def test_offsets_shift_the_whole_schedule_until_it_covers_the_drive(cars):

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from matplotlib.colors import to_rgb
 
 from dlkf.base.errors import InputError
 from dlkf.base.files import write_into
@@ -28,6 +29,7 @@ from dlkf.evaluation.table import (
     as_markdown,
     format_interval,
     format_number,
+    format_ratios,
     ratio_table,
     result_tables,
     slope_table,
@@ -36,6 +38,7 @@ from dlkf.filters.build import build_filter
 from dlkf.filters.tuning import Tuning
 from dlkf.report.compare import StoredReport, describe_tests, end_table, mark_best_of_each, shorten_names
 from dlkf.report.evaluation import describe_average, evaluation_page, least_error, outage_rows, write_report
+from dlkf.report.page import format_setting
 from dlkf.report.training import learning_curve
 from tests.cars import IMU
 from tests.evaluation.drawn import figures_of
@@ -99,6 +102,57 @@ def test_tables_hold_the_summarise_scores(scores):
     assert all(len(row) == len(t.columns) for t in (whole, outages) for row in t.rows)
     markdown = as_markdown(whole)
     assert markdown.count("\n| ") == 3 and "| mbkf15 |" in markdown
+
+
+def test_gnss_is_throughout_only_where_no_fix_lacks_for_long(cars):
+    """A gap of the drive's own is named, whether fixes are missing or not valid; what comes after the truth is none."""
+    valid, available, truth = cars.gnss_valid.clone(), cars.available.clone(), cars.truth_valid.clone()
+    valid[0, 20:32, :3] = False
+    available[1, 20:25] = False
+    available[2, 45:] = truth[2, 45:] = False
+    batch = replace(cars, gnss_valid=valid, available=available, truth_valid=truth)
+
+    def say(row):
+        one = score(FILTERS, [batch.select(torch.tensor([row]))])
+        return headline(summarise_scores(one, resamples=50))
+
+    assert say(0).startswith("With all fixes of the drives, at most 12 s without one: mbkf15 is ")
+    assert all(say(row).startswith("With GNSS throughout: mbkf15 is ") for row in (1, 2))
+    both = summarise_scores(score(FILTERS, [batch.select(torch.tensor([k])) for k in (0, 1)]), resamples=50)
+    assert both.count["longest_without_fix_s"] == 12.0
+    older = replace(both, count={k: v for k, v in both.count.items() if k != "longest_without_fix_s"})
+    assert headline(older).startswith("With all fixes of the drives: mbkf15 is ")
+
+
+def test_a_bound_of_a_ratio_reads_on_its_side_of_1():
+    """Whether 1 is in the interval is what a reader looks for."""
+    for bounds, said in (
+        ((0.9225, 0.8627, 1.0095), ["0.92", "0.86", "1.01"]),
+        ((0.9225, 0.8627, 1.0045), ["0.922", "0.863", "1.004"]),
+        ((0.98, 0.95, 0.9996), ["0.9800", "0.9500", "0.9996"]),
+        ((1.0, 0.012, 12.345), ["1.00", "0.012", "12.3"]),
+        ((math.nan, math.inf), ["–", "∞"]),
+    ):
+        assert format_ratios(*bounds) == said
+
+
+def test_drift_says_of_how_many_outages_it_is(scores):
+    """A car that stands has no error per distance; a reference that begins just after the last fix takes none away."""
+    truth = scores.truth_v_n.copy()
+    truth[0], truth[1, 29] = 0.0, np.nan
+    (_, table), (_, before) = (
+        result_tables("town", summarise_scores(s, resamples=50)) for s in (replace(scores, truth_v_n=truth), scores)
+    )
+    assert "(median over the 5 outages of more than 1 m)" in table.note and "(median)" in before.note
+
+
+def test_the_recordings_of_a_ratio_are_those_that_have_it(scores):
+    """Fewer drives have an outage than a segment: then every column says of how many it is."""
+    part = replace(scores, outage=scores.outage & (np.arange(6) < 2)[:, None])
+    ratios = ratio_table("town", summarise_scores(part, resamples=50))
+    assert ratios.title.endswith("ratio to mbkf15")
+    counts = [column.rpartition("\n")[2] for column in ratios.columns[1:]]
+    assert counts == ["2 recordings"] * 2 + ["6 recordings"] * 3
 
 
 def test_kalman_filters_that_nobody_tuned_are_named_beside_a_learned_one():
@@ -180,6 +234,25 @@ def test_figures_have_content(scores, draw):
     data = png(figure, dpi=40)
     assert data.startswith(b"\x89PNG") and len(data) > 5000
     assert all(ax.get_xlabel() or ax.get_shared_x_axes() for ax in figure.axes)
+
+
+def test_figures_say_what_is_drawn_in_which_colour(scores):
+    """A histogram names the filters that it has, and counts in whole outages; a band has no filter's colour."""
+    names = list(scores.filters)
+    both, one = (figures.error_histograms(scores, drawn) for drawn in (names, names[-1:]))
+    assert both.get_suptitle() == "" and one.get_suptitle() == f"1 of {len(names)} filters: {names[-1]}"
+    for figure in (both, one):
+        assert all(tick == round(tick) for ax in figure.axes if ax.get_visible() for tick in ax.get_yticks())
+    legend = figures.imu_errors(scores, 1).legends[0]
+    patches = {t.get_text(): patch for t, patch in zip(legend.get_texts(), legend.legend_handles)}
+    colours = [to_rgb(patches[name].get_color()) for name in patches if name in names]
+    band = to_rgb(patches["±3σ, in the colour of each filter"].get_facecolor())
+    assert colours and len(set(band)) == 1 and band not in colours
+
+
+def test_an_empty_list_is_none_and_not_unknown():
+    """``aids=[]`` beside ``aids=[speed]``."""
+    assert [format_setting(x) for x in ([], ["speed", "baro"], None, {})] == ["none", "speed, baro", "–", "–"]
 
 
 @pytest.mark.whole

@@ -11,7 +11,7 @@ from dlkf.base.errors import InputError
 from dlkf.data.masks import BiasLaw
 from dlkf.evaluation.metrics import magnitudes, rms_over_segments, slope
 from dlkf.evaluation.outages import OutagePlan
-from dlkf.evaluation.study import inject_bias
+from dlkf.evaluation.study import choose_baseline, inject_bias
 from dlkf.filters.build import build_filter
 from dlkf.filters.integration import Correction
 from dlkf.filters.model_based import Ins
@@ -20,6 +20,19 @@ from tests.cars import IMU
 from tests.evaluation.scoring import score
 
 FILTERS = {name: build_filter(name, IMU) for name in ("ins", "mbkf15")}
+
+
+@pytest.mark.parametrize(
+    ("named", "models", "chosen"),
+    [
+        (None, ["ins", "mbkf15", "plus"], "mbkf15"),
+        (None, ["mbkf21_car", "plus"], "mbkf21_car"),
+        ("plus", ["mbkf15", "plus"], "plus"),
+        ("mbkf15", ["mbkf21_car", "plus"], "mbkf15"),  # a filter that is not among them: no ratios, which is said
+    ],
+)
+def test_the_baseline_is_the_one_named_or_the_usual_or_the_first(named, models, chosen):
+    assert choose_baseline(named, models) == chosen
 
 
 def _ragged(batch):

@@ -8,7 +8,7 @@ import pickle
 import re
 import shutil
 import subprocess
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -241,7 +241,7 @@ def test_one_library_serves_every_preset_and_every_factor():
     other = ImuSpec(
         "b", SensorErrors(1e-3, 0.03, 2e-3, 600.0, 1e-3, 4e-3), SensorErrors(3e-5, 2e-3, 3e-4, 300.0, 0.0, 1e-3)
     )
-    changed = Tuning(**{f.name: (0.9 if 0.9 <= f.default < 1 else 1.7) * f.default for f in fields(Tuning)})
+    changed = Tuning(**{k: (0.9 if 0.9 <= x < 1 else 1.7) * x for k, x in Tuning().factors().items()})
     recorded = []
     for imu, tuning in ((IMU, Tuning()), (other, changed)):
         estimator = build_filter("aekf_car_gated", imu, tuning=tuning)  # everything that has factors

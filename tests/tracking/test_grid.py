@@ -66,7 +66,8 @@ def test_a_sweep_that_finishes(uri, client, capsys):
     assert printed.index("better") < printed.index("worse") and parent in printed
     assert found.data.tags["best_run"] == "better"
     assert found.data.metrics["test/dlkf/outage_end_horizontal_m"] == 2.0, "scores of the best beside the grid"
-    assert "outage_end_horizontal_m" in printed and "better" in found.data.tags["mlflow.note.content"]
+    title = "Horizontal error at the end of the outages, RMS [m]; test segments, runs by their validation"
+    assert title in printed.splitlines() and "better" in found.data.tags["mlflow.note.content"]
     table = mlflow_module().artifacts.load_text(f"{found.info.artifact_uri}/comparison.csv").splitlines()
     assert table[0].startswith("run,run_id,status,optimizer.lr,val/outage_end_m,test/dlkf/")
     assert table[1] == f"worse,{worse.id},FINISHED,worse,10.0,5.0,9.0"

@@ -16,6 +16,7 @@ import yaml
 from dlkf.base.console import warn_once
 from dlkf.base.errors import InputError
 from dlkf.data.masks import withhold_fixes
+from dlkf.data.store import dataset_digest
 from dlkf.evaluation.metrics import PVA
 from dlkf.evaluation.outages import OutagePlan
 from dlkf.filters.build import build_filter
@@ -217,11 +218,20 @@ def test_the_command_writes_factors_that_evaluate_takes(uri, call, town):
     done = call("tune", "model=mbkf15", f"dataset={town}", "imu=perfect", "name=cars", "out=found", *size)
     assert done.code == 0, done.err
     factors = yaml.safe_load(Path("found/tuning/cars.yaml").read_text())
+    fitted_on = factors.pop("fitted_on")
     assert Tuning(**factors) != Tuning()  # a perfect IMU's noise is too small here
+    assert fitted_on["recordings"] == ["g1", "g2"] and fitted_on["digest"] == dataset_digest(town)
     assert "train" in done.out and "test" in done.out and Path("mlflow.db").is_file()
     cut = ("length_s=50", "outage.first_s=25", "outage.duration_s=20", "injected_bias=null")
     done = call("evaluate", "--config-dir", "found", "tuning=cars", "model=mbkf15", f"dataset={town}", "out=seen", *cut)
     assert done.code == 0, done.err
+    said = "the tuning of mbkf15 was fitted on 2 of these 3 recordings, which flatters it; unseen=true leaves them out"
+    assert said in " ".join(done.out.split())
+    unseen = ("model=mbkf15", f"dataset={town}", "out=unseen", "unseen=true")
+    done = call("evaluate", "--config-dir", "found", "tuning=cars", *unseen, *cut)
+    assert done.code == 0 and "was fitted" not in done.out, done.err
+    content = json.loads(Path("unseen/metrics.json").read_text())
+    assert content["results"][0]["count"]["groups"] == 1 and "fitted_on" not in content["protocol"]["tuning"]
     done = call("tune", "model=mbkf15", f"dataset={town}", "out=none", *size[:1], "outage.first_s=45", *size[2:])
     assert done.code == 2 and not Path("none").exists(), done.err
 

@@ -23,14 +23,17 @@ def first_line(error: Exception) -> str:
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """``; did you mean x?`` where a known name is close to this one, else nothing; of several as close the one that
-    begins alike, then the first."""
+    """``; did you mean x?`` where a known name is close to this one, else nothing; the closest has two neighbours
+    swapped, of several as close it is the one that begins alike, then the first."""
 
     def closeness(other: str) -> tuple[float, int]:
         alike = next((k for k, (a, b) in enumerate(zip(other, name)) if a != b), min(len(other), len(name)))
-        return difflib.SequenceMatcher(None, other.lower(), name.lower()).ratio(), alike
+        ratio = difflib.SequenceMatcher(None, other.lower(), name.lower()).ratio()
+        return 1.0 if other.lower() in swapped else ratio, alike
 
     name = str(name)
+    small = name.lower()
+    swapped = {small[:k] + small[k : k + 2][::-1] + small[k + 2 :] for k in range(len(small))}
     best = max(known, key=closeness, default="")
     return f"; did you mean {best}?" if best and closeness(best)[0] >= CLOSE else ""
 

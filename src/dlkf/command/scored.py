@@ -49,7 +49,7 @@ class EvaluateSettings(FilterSettings, DriveSelection, ScoringSettingsBase):
     parallel: int | str | None
     unseen: bool
     settle_s: float
-    baseline: str
+    baseline: str | None
     figures: bool
     tracking: StoreSettings
 

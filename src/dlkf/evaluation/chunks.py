@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -15,8 +15,10 @@ from dlkf.base.console import ProgressCallback, show_progress
 from dlkf.base.errors import InputError, no_drives
 from dlkf.base.parallel import parallel_map
 from dlkf.data.alignment import ALIGN, AlignConfig
+from dlkf.data.drive import Drive
 from dlkf.data.masks import BiasLaw
 from dlkf.data.store import load_dataset
+from dlkf.evaluation.metrics import outage_intervals
 from dlkf.evaluation.protocol import REFUSED, NoSegment, Protocol, Scenes, describe_short
 from dlkf.evaluation.scores import Scores, join_scores
 from dlkf.evaluation.study import run_scenes
@@ -95,18 +97,47 @@ def evaluate_chunks(
     return Evaluated(scores, rules, truth)
 
 
-def score_chunk(work: EvaluationJob, names: tuple[str, ...]) -> ChunkResult:
-    """One chunk."""
+def suggest_more_outages(
+    work: EvaluationJob, chunks: Sequence[tuple[str, ...]], count: int, parallel: int | str | None = None
+) -> str:
+    """A line for few outages, ``count`` of them in segments: how many the same drives have with ``mode=drives``."""
+    whole = replace(work, protocol=replace(work.protocol, mode="drives"))
+    drives = sum(parallel_map(partial(count_outages, whole), chunks, parallel))
+    if drives > count:
+        return f"Few outages ({count}); mode=drives scores whole drives and has {drives}."
+    smaller = "a smaller outage.duration_s or outage.first_s"
+    return f"Few outages ({count}), and mode=drives has no more ({drives}); with {smaller} it has."
+
+
+def count_outages(work: EvaluationJob, names: tuple[str, ...]) -> int:
+    """How many outages a chunk has; no filter runs over them."""
+    try:
+        scenes = Scenes(_with_reference(work, _load(work, names))[0], work.protocol)
+    except InputError:
+        return 0
+    return sum(len(outage_intervals(mask.numpy()).segment) for _, mask in scenes)
+
+
+def _load(work: EvaluationJob, names: tuple[str, ...]) -> list[Drive]:
     wanted = {"dtype": torch.float64, "reference": work.reference == "file", "drives": names}
     with _bar(work, "Loading drives") as progress:
-        drives = load_dataset(work.dataset, progress=progress, **wanted, **work.grid)
-    sigma, left_out = None, {}
+        return load_dataset(work.dataset, progress=progress, **wanted, **work.grid)
+
+
+def _with_reference(work: EvaluationJob, drives: list[Drive]) -> tuple[list[Drive], Tensor | None, Mapping[str, str]]:
+    """The drives, of a reference that is made its 1σ, and the drives that have none."""
+    if work.reference == "file":
+        return drives, None, {}
+    assert isinstance(work.smoother, Mbkf)
+    with _bar(work, "Making the reference") as progress:
+        return make_reference(drives, work.reference, work.smoother, work.align, progress)
+
+
+def score_chunk(work: EvaluationJob, names: tuple[str, ...]) -> ChunkResult:
+    """One chunk."""
+    drives = _load(work, names)
     try:
-        if work.reference != "file":
-            assert isinstance(work.smoother, Mbkf)
-            with _bar(work, "Making the reference") as progress:
-                made = make_reference(drives, work.reference, work.smoother, work.align, progress)
-            drives, sigma, left_out = made.drives, made.sigma, made.skipped
+        drives, sigma, left_out = _with_reference(work, drives)
         scenes = Scenes(drives, work.protocol)
     except NoSegment as error:
         return ChunkResult(names, short=names, refused=error)

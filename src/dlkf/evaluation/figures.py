@@ -20,6 +20,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+from matplotlib.ticker import MaxNLocator
 
 from dlkf.base.colours import COLOURS, SHADE
 from dlkf.evaluation.bootstrap import MIN_GROUPS, rms_band
@@ -216,7 +217,7 @@ def imu_errors(scores: Scores, i: int) -> Figure:
     handles: list[Artist] = [Line2D([], [], color="black", lw=1.4, label="truth")] if known else []
     handles += _filter_handles(scores, runs)
     if any(np.isfinite(r.imu_std[i]).any() for r in scores.filters.values()):
-        handles.append(Patch(color=COLOURS[1], alpha=0.2, label="±3σ of each filter"))
+        handles.append(Patch(color="#666666", alpha=0.5, lw=0, label="±3σ, in the colour of each filter"))
     figure.suptitle(f"IMU-error estimates, {scores.describe_segment(i)}", fontsize=10)
     _legend(figure, handles + _outage_handle(scores, [i]))
     return figure
@@ -258,7 +259,7 @@ def error_growth(scores: Scores) -> Figure:
 def error_histograms(scores: Scores, names: Sequence[str]) -> Figure:
     """How the outages are spread: horizontal RMS since the outage began, 10, 20, … s into it (paper fig. 14, R148).
 
-    At most six times; the last bin holds what lies beyond.
+    At most six times; the last bin holds what lies beyond. The title says which of several filters are drawn.
     """
     w = scores.windows
     times = np.arange(10.0, w.length.min() * scores.epoch_s + 1e-9, 10.0)[:6]
@@ -277,10 +278,13 @@ def error_histograms(scores: Scores, names: Sequence[str]) -> Figure:
             ax.stairs(heights, edges, lw=1.6, fill=last, alpha=0.7 if last else 1, **line_style(scores, n))
         ax.set(xlim=(0, top))
         ax.set_title(f"{count * scores.epoch_s:g} s without GNSS", fontsize=9)
+        ax.yaxis.set_major_locator(MaxNLocator(integer=True))
         plain_axes(ax)
+    if len(names) < len(scores.filters):
+        figure.suptitle(f"{len(names)} of {len(scores.filters)} filters: {', '.join(names)}", fontsize=10)
     for ax in panels.flat[len(counts) :]:
         ax.set_visible(False)
-    for ax in panels[-1]:
+    for ax in panels.flat[: len(counts)][-2:]:  # the lowest of each column
         ax.set_xlabel("Horizontal RMS since the outage began [m]", fontsize=9)
     for ax in panels[:, 0]:
         ax.set_ylabel("Outages", fontsize=9)

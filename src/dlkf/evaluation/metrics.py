@@ -186,10 +186,12 @@ def outage_rms(x: Array, w: OutageIntervals) -> Array:
 def outage_distance(v_truth: Array, w: OutageIntervals, epoch_s: float) -> Array:
     """Horizontal distance driven in each outage [m] from the true velocity (P, T, 3) at the epochs' ends.
 
-    Trapezoid over the outage's epochs; a missing true velocity makes the distance NaN.
+    Trapezoid over the outage's epochs; where the velocity before one is missing, as at the start of an outage without
+    truth there, that at its end counts for all of it. A missing velocity at the end of an epoch makes the distance NaN.
     """
     speed = np.hypot(v_truth[..., 0], v_truth[..., 1])
     before = np.concatenate((speed[:, :1], speed[:, :-1]), -1)
+    before = np.where(np.isnan(before), speed, before)
     step = 0.5 * (speed + before) * epoch_s
     cumulative = np.concatenate((np.zeros((len(step), 1)), np.cumsum(np.nan_to_num(step), -1)), -1)
     missing = np.concatenate((np.zeros((len(step), 1)), np.cumsum(np.isnan(step), -1)), -1)

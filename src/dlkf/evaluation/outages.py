@@ -7,7 +7,8 @@ and the error of the last withheld epoch is the error after exactly d seconds wi
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -51,6 +52,20 @@ class OutagePlan:
                 "leave time with GNSS between them"
             )
 
+    def in_whole_epochs(self, epoch_s: float) -> OutagePlan:
+        """The plan with every time rounded down to whole epochs, a duration to one at least."""
+
+        def whole(seconds: float, least: int = 0) -> float:
+            epochs = max(int(seconds / epoch_s + 1e-6), least)
+            return seconds if abs(seconds - epochs * epoch_s) < 1e-6 * epoch_s else round(epochs * epoch_s, 9)
+
+        def each(value: Any, least: int = 0) -> Any:
+            if value is None or isinstance(value, (int, float)):
+                return value and whole(value, least)
+            return type(value)(whole(x, least) for x in value)
+
+        return OutagePlan(each(self.first_s), each(self.duration_s, 1), each(self.every_s), each(self.offsets_s))
+
     def masks(self, batch: Batch, seed: int = 0) -> list[Tensor]:
         """One mask (B, T) per offset, True where a fix is withheld; only outages that can be scored stay.
 
@@ -93,6 +108,16 @@ def scorable_outages(batch: Batch, outage: Tensor) -> Tensor:
     faulty = torch.zeros(outage.shape[0], int(window.max()) + 1, dtype=torch.long)
     faulty.scatter_add_(1, window, (outage & (~truth | bad_start)).long())
     return outage & (faulty.gather(1, window) == 0)
+
+
+def describe_rounding(plan: OutagePlan | None, epoch_s: float) -> str:
+    """One line on the times of a plan that are not whole epochs, with those that are taken; empty if all are."""
+    rounded = plan and plan.in_whole_epochs(epoch_s)
+    if plan is None or rounded is None or rounded == plan:
+        return ""
+    before, after = asdict(plan), asdict(rounded)
+    changed = [f"outage.{name}={_as_text(after[name])}" for name in before if before[name] != after[name]]
+    return f"rounded to whole epochs of {epoch_s:g} s: {', '.join(changed)}"
 
 
 def describe_unused(plan: OutagePlan, outage: np.ndarray, ends_s: np.ndarray, drives: Sequence[str]) -> str:
@@ -141,6 +166,10 @@ def bounds(name: str, value: float | Sequence[float]) -> tuple[float, float]:
         given = values if len(values) > 1 else values[0]
         raise InputError(f"{name} is {given}, must be a number ≥ 0 or [low, high] in seconds{several}")
     return float(values[0]), float(values[-1])
+
+
+def _as_text(value: float | Sequence[float]) -> str:
+    return f"{value:g}" if isinstance(value, (int, float)) else f"[{','.join(f'{x:g}' for x in value)}]"
 
 
 def _draw(value: float | Sequence[float], batch: Batch, seed: int, name: str) -> Tensor:

@@ -71,9 +71,9 @@ class Scenes:
 
     The same protocol gives the same scenes for all filters: each segment has its own draws of start error
     and outage. ``segments`` are those to use, else they are cut by the protocol; ``limit`` keeps so many, spread evenly
-    over all. ``mode`` is the one chosen, ``runs`` the number of segments over all scenes, ``skipped`` the drives that
-    cannot be used and why, ``short`` those of which no segment could be cut although segments are scored. InputError
-    where nothing can be scored or no outage fits into the segments.
+    over all. ``mode`` is the one chosen, ``outage`` the plan in whole epochs, ``runs`` the number of segments over all
+    scenes, ``skipped`` the drives that cannot be used and why, ``short`` those of which no segment could be cut
+    although segments are scored. InputError where nothing can be scored or no outage fits into the segments.
     """
 
     def __init__(
@@ -85,6 +85,7 @@ class Scenes:
         limit: int | None = None,
     ) -> None:
         stack = stack_drives(drives)
+        plan = protocol.outage and protocol.outage.in_whole_epochs(stack.epoch_s)
         self.short: tuple[str, ...] = ()
         self.refused = {drive.name: str(drive.refused) for drive in drives if any(drive.refused)}
         if segments is None and protocol.mode != "drives":
@@ -103,14 +104,14 @@ class Scenes:
                     "or mode=drives"
                 )
             self._batches = [(stack, part) for part in _parts(segments, [p.epochs for p in segments], stack)]
-            self.outage = protocol.outage and drives_that_fit(protocol.outage, protocol.length_s)
+            self.outage = plan and drives_that_fit(plan, protocol.length_s)
         else:
             starts = self._align(stack, protocol.align)
             starts = {d: starts[d] for d in spread_evenly(list(starts), limit)}
             order = sorted(starts, key=lambda d: -stack[d].epochs)  # like lengths together: little padding
             parts = _parts(order, [stack[d].epochs for d in order], stack)
             self._batches = [([stack[d] for d in part], [starts[d] for d in part]) for part in parts]
-            self.outage = protocol.outage and repeat_outages(protocol.outage)
+            self.outage = plan and repeat_outages(plan)
         self.protocol = protocol
         offsets = len(self.outage.offsets_s or ()) if self.outage else 1
         self.runs = offsets * sum(len(part) for _, part in self._batches)

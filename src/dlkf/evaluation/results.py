@@ -34,6 +34,7 @@ from dlkf.running.innovations import rms
 
 SETTLE_S = 10.0  # "settled" leaves out this much of every segment, where the initial error dominates
 INTO_OUTAGE_S = (10.0, 20.0, 30.0, 40.0, 50.0, 60.0)
+LEAST_M = 1.0  # an outage in which a car drives less has no error per distance
 BASELINE = "mbkf15"
 COMPARED = ("rms", "mean", "geomean")  # statistics of which ratios to the baseline are given
 IMU_AXES = {f"{sensor}_{axis}": unit for sensor, unit in (("accel", "m/s²"), ("gyro", "rad/s")) for axis in "xyz"}
@@ -183,6 +184,7 @@ def summarise_scores(
             "outages": len(w.segment),
             "outage_drives": len({scores.segments[i].drive for i in w.segment}),
             "outage_s": [float(lengths.min()), float(lengths.max())] if len(lengths) else None,
+            "longest_without_fix_s": scores.longest_without_fix_s,
             "scored_s": float((~np.isnan(scores.truth_p_n[..., 0])).sum() * scores.epoch_s),
         },
         settle_s=settle_s,
@@ -244,7 +246,7 @@ def _outage_samples(scores: Scores, name: str, distance: Array) -> dict[tuple[st
     std = scores.filters[name].position_std
     end = {q: outage_end(size[q], w) for q in QUANTITIES}
     with np.errstate(divide="ignore", invalid="ignore"):
-        end["drift"] = np.where(distance > 1.0, end["horizontal"] / distance, np.nan)
+        end["drift"] = np.where(distance > LEAST_M, end["horizontal"] / distance, np.nan)
     found = {("outages", "end", q): x for q, x in end.items()}
     found |= {("outages", "rms", q): outage_rms(size[q], w) for q in QUANTITIES}
     found |= {("outages", f"at {s:g} s", q): at[q][:, i] for i, s in enumerate(seconds) for q in QUANTITIES}

@@ -48,8 +48,8 @@ def score_scenes(
     for batch, mask in scenes:
         if parts and abs(batch.epoch_s - parts[0].epoch_s) > 1e-9:
             raise InputError("the batches to be scored have different epoch lengths; score them one by one")
-        parts.append(_blank_scores(batch, mask, groups or {}, kinds))
         masked = withhold_fixes(batch, mask)
+        parts.append(_blank_scores(masked, mask, groups or {}, kinds))
         for name, estimator in filters.items():
             parts[-1].filters[name] = _blank(batch, len(aid_columns(estimator)))
             for index in chunks(batch, chunk_samples):
@@ -63,7 +63,7 @@ def score_scenes(
 
 
 def _blank_scores(batch: Batch, mask: Tensor, groups: Mapping[str, str], kinds: Mapping[str, str] | str) -> Scores:
-    """The segments of a scene and their truth, before any filter ran."""
+    """The segments of a scene, the fixes that are left of it and its truth, before any filter ran."""
     known = (batch.truth_valid & batch.present).unsqueeze(-1)
     p, v = (torch.where(known, x.double(), torch.nan).cpu().numpy() for x in batch.truth[:2])
     kind_of = (lambda d: kinds) if isinstance(kinds, str) else (lambda d: kinds.get(d, "unknown"))
@@ -73,6 +73,7 @@ def _blank_scores(batch: Batch, mask: Tensor, groups: Mapping[str, str], kinds: 
             SegmentSource(d, groups.get(d, d), kind_of(d), t) for d, t in zip(batch.drive, batch.t_start.tolist())
         ],
         outage=mask.cpu().numpy(),
+        fix=(batch.gnss_valid[..., :3].all(-1) & batch.available).cpu().numpy(),
         truth_p_n=p,
         truth_v_n=v,
         true_imu_error=batch.true_imu_error.double().cpu().numpy(),

@@ -47,6 +47,7 @@ class Scores:
     epoch_s: float
     segments: list[SegmentSource]
     outage: Mask  # (P, T) fix withheld
+    fix: Mask  # (P, T) position that the filters were given
     truth_p_n: Array  # (P, T, 3)
     truth_v_n: Array  # (P, T, 3)
     true_imu_error: Array  # (P, T, 6)
@@ -64,6 +65,12 @@ class Scores:
         """Time of the last truth of each segment [s since its start], (P,), and their drives."""
         last = np.where(np.isfinite(self.truth_p_n[..., 0]), self.t, 0.0).max(1)
         return last, [segment.drive for segment in self.segments]
+
+    @property
+    def longest_without_fix_s(self) -> float:
+        """Longest time without a fix [s] before the last truth of a segment, outages included."""
+        without = ~self.fix & (self.t <= self.ends[0][:, None])
+        return self.epoch_s * float(outage_intervals(without).length.max(initial=0))
 
     def geodetic(self, segment: int, p_n: Array) -> Array:
         """Latitude and longitude [°] (…, 2) of positions (…, 3) in the tangent frame of a segment."""
@@ -117,6 +124,7 @@ def join_scores(parts: Sequence[Scores]) -> Scores:
         epoch_s=parts[0].epoch_s,
         segments=[segment for s in parts for segment in s.segments],
         outage=rows(parts, "outage").astype(np.bool_, copy=False),
+        fix=rows(parts, "fix").astype(np.bool_, copy=False),
         truth_p_n=rows(parts, "truth_p_n"),
         truth_v_n=rows(parts, "truth_v_n"),
         true_imu_error=rows(parts, "true_imu_error"),

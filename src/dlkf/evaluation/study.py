@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager
 
 import torch
 from torch import Tensor
 
 from dlkf.base.console import ProgressCallback, show_progress
+from dlkf.base.errors import InputError, did_you_mean
 from dlkf.data.draws import segment_generator
 from dlkf.data.masks import BiasLaw, add_bias
 from dlkf.evaluation.protocol import Scenes
 from dlkf.evaluation.results import BASELINE, SETTLE_S, Results, last_finite, summarise_scores
 from dlkf.evaluation.run import Scene, score_scenes
 from dlkf.evaluation.scores import Scores
+from dlkf.filters.build import filter_names, is_filter
 from dlkf.filters.smoother import Filter
 
 
@@ -66,6 +68,19 @@ def inject_bias(
     scores.injected_bias = torch.cat(drawn).numpy()
     for name, run in scores.filters.items():
         run.bias_response = last_finite(shifted.filters[name].imu_error) - last_finite(run.imu_error)
+
+
+def choose_baseline(baseline: str | None, models: Collection[str]) -> str:
+    """The filter that the others are compared with: the one that was named, else ``mbkf15`` or, without it, the first.
+
+    InputError for a name that is neither among the models nor a filter's.
+    """
+    if baseline is None:
+        return BASELINE if BASELINE in models else next(iter(models))
+    if baseline not in models and not is_filter(baseline):
+        near = did_you_mean(baseline, (*models, *filter_names())) or "; see model="
+        raise InputError(f"baseline={baseline} is none of the models {', '.join(models)}{near}")
+    return baseline
 
 
 def make_results(

@@ -8,12 +8,13 @@ from collections.abc import Iterable, Sequence
 from dlkf.evaluation.bootstrap import MIN_GROUPS
 from dlkf.evaluation.results import Results
 from dlkf.evaluation.scores import Scores
-from dlkf.evaluation.table import DEGREES, format_number
+from dlkf.evaluation.table import DEGREES, format_number, format_ratios
 from dlkf.filters.build import is_filter
 from dlkf.filters.tuning import Tuning
 from dlkf.running.innovations import OF_NETWORK, REMEDY, fit_sigma
 
 FEW = 20  # outages or segments; fewer have no 95 %: their largest error stands instead
+THROUGHOUT_S = 5.0  # the longest time without a fix that is no gap
 END = ("outages", "end", "horizontal")
 METRICS = {
     "outage_end_horizontal_m": (*END, "rms"),
@@ -49,7 +50,7 @@ def headline(result: Results) -> str:
     "60 s without GNSS, 40 outages: plus ends 8.8 m from the reference in the median (1.4 % of the distance driven),
     within 33 m in 95 % of them; best classical filter mbkf21_car 10 m, 41 m." The best has the least median. Of fewer
     than :data:`FEW` outages the largest error takes the place of the 95 %, with a warning. Without outages the
-    horizontal error over the settled part of the segments.
+    horizontal error over the settled part of the segments, with the longest time without a fix unless it is short.
     """
     span = result.count["outage_s"]
     where = ("outages", "end", "horizontal") if span else ("segments", "settled", "horizontal")
@@ -61,7 +62,10 @@ def headline(result: Results) -> str:
     if not order:
         return "No filter could be scored: there is no valid reference where it counts."
     best, texts = order[0], {n: [f"{format_number(x)} m" for x in errors[n]] for n in order}
-    lead = f"{_length(*span)} without GNSS" if span else "With GNSS throughout"
+    gap = result.count.get("longest_without_fix_s", math.inf)
+    own = "With GNSS throughout" if gap <= THROUGHOUT_S else "With all fixes of the drives"
+    own += f", at most {gap:.3g} s without one" if THROUGHOUT_S < gap < math.inf else ""
+    lead = f"{_length(*span)} without GNSS" if span else own
     text = f"{lead}, {count} {unit}{'s' if count > 1 else ''}: {best} ends " if span else f"{lead}: {best} is "
     drift = result.value(best, "outages", "end", "drift", "median") if span else math.nan
     share = f" ({format_number(100 * drift, digits=2)} % of the distance driven)" if math.isfinite(drift) else ""
@@ -86,9 +90,7 @@ def describe_verdict(result: Results, name: str) -> str | None:
     baseline = result.baseline
     comparison = result.versus(name, *END, "geomean")
     if baseline is not None and comparison is not None:
-        ratio, low, high = (
-            format_number(x, digits=2) for x in (comparison.ratio, comparison.ratio_low, comparison.ratio_high)
-        )
+        ratio, low, high = format_ratios(comparison.ratio, comparison.ratio_low, comparison.ratio_high)
         if comparison.groups < MIN_GROUPS:
             direction = "worse" if comparison.ratio > 1 else "better"
             verdict = f"{ratio} by geometric mean: {direction}, but too few recordings for an interval"

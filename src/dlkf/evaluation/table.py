@@ -19,7 +19,7 @@ from rich.table import Table as RichTable
 from rich.text import Text
 
 from dlkf.evaluation.bootstrap import MIN_GROUPS, Comparison
-from dlkf.evaluation.results import IMU_AXES, Results, Value
+from dlkf.evaluation.results import IMU_AXES, LEAST_M, Results, Value
 
 DASH = "–"
 DEGREES = 180 / math.pi
@@ -55,11 +55,21 @@ def format_number(x: float, scale: float = 1.0, digits: int = 3) -> str:
     return f"{x:.{min(decimals, 6)}f}" if abs(x) < 1e5 else f"{x:.2e}"
 
 
+def format_ratios(*ratios: float) -> list[str]:
+    """Ratios in two decimals, in three or four where one that is not 1 would read 1.00: each stands on its side of 1.
+
+    Those below 0.1 and from 10 on in two and three significant digits.
+    """
+    near = [x for x in ratios if 0.1 <= x < 10 and x != 1]
+    decimals = next((n for n in (2, 3) if not any(round(x, n) == 1 for x in near)), 4)
+    return [f"{x:.{decimals}f}" if 0.1 <= x < 10 else format_number(x, digits=3 if x > 1 else 2) for x in ratios]
+
+
 def format_interval(c: Comparison | None) -> str:
     """Ratio with its interval: ``0.71 [0.62–0.83]``, ``0.71 (n<8)`` of too few recordings; 1 of the baseline."""
     if c is None:
         return "1"
-    ratio, low, high = (format_number(x, digits=2) for x in (c.ratio, c.ratio_low, c.ratio_high))
+    ratio, low, high = format_ratios(c.ratio, c.ratio_low, c.ratio_high)
     if c.groups < MIN_GROUPS:
         return ratio if ratio == DASH else f"{ratio} (n<{MIN_GROUPS})"
     return f"{ratio} [{low}–{high}]"
@@ -103,11 +113,14 @@ def outage_table(what: str, result: Results) -> ResultTable:
     n, low, high = result.count, *result.count["outage_s"]
     length = f"{low:g} s" if low == high else f"{low:g} to {high:g} s"
     at = [s for s in result.seconds_into_outage() if float(s) < high][-2:]
+    driven = int(max(result.value(name, "outages", "end", "drift", "n") for name in result.filters))
+    of_some = f" over the {_count(driven, 'outage')} of more than {LEAST_M:g} m" if driven < n["outages"] else ""
     table = ResultTable(
         title=f"{what}: {_count(n['outages'], 'outage')} of {length}, {_count(n['outage_drives'], 'drive')}",
         note="Horizontal error at the end (RMS, median, 95 % over the outages), at times into it (RMS); velocity and "
-        "attitude at the end (RMS); drift: horizontal error per distance driven (median); own 1σ: what the filter says "
-        "of its horizontal error at the end (median); innov. / σ: innovations over the 1σ that it expects (RMS).",
+        f"attitude at the end (RMS); drift: horizontal error per distance driven (median{of_some}); own 1σ: what the "
+        "filter says of its horizontal error at the end (median); innov. / σ: innovations over the 1σ that it expects "
+        "(RMS).",
         columns=["Filter", "End, RMS\n[m]", "median\n[m]", "95 %\n[m]"]
         + [f"RMS\n{s} s\n[m]" for s in at]
         + ["Velocity\n[m/s]", "Attitude\n[°]", "Drift\n[%]", "Own 1σ\n[m]", "Innov.\n/ σ"],
@@ -139,14 +152,16 @@ def ratio_table(dataset: str, result: Results) -> ResultTable | None:
     heads = {h: which for h, which in RATIOS.items() if any(result.versus(n, *which) for n in names)}
     if not heads:
         return None
-    groups = result.comparisons[0].groups
+    groups = {h: max(c.groups for n in names if (c := result.versus(n, *which))) for h, which in heads.items()}
+    alike = len(set(groups.values())) == 1
+    counts = {h: _count(n, "recording") for h, n in groups.items()}
     return ResultTable(
-        title=f"{dataset} ({result.kind}): ratio to {result.baseline}, {_count(groups, 'recording')}",
+        title=f"{dataset} ({result.kind}): ratio to {result.baseline}" + (f", {next(iter(counts.values()))}" * alike),
         note="Below 1: better than it. Of the horizontal error at the end of the outages: RMS, which the largest "
         "errors decide, and geometric mean, to which every outage counts alike. Of the segments' RMS (3D): mean over "
         "the segments, as in the paper. In brackets the 95 % interval by paired bootstrap over the recordings; "
         f"n<{MIN_GROUPS}: too few recordings for one.",
-        columns=["Filter", *heads],
+        columns=["Filter", *(h if alike else f"{h},\n{counts[h]}" for h in heads)],
         rows=[[n, *(format_interval(result.versus(n, *which)) for which in heads.values())] for n in names],
     )
 

@@ -11,8 +11,10 @@ from dlkf.base.documents import read_yaml
 from dlkf.base.errors import InputError, count_calls
 from dlkf.data.kinds import drive_imus, drive_rates
 from dlkf.data.tables import DriveRow
+from dlkf.filters.tuning import Tuning
 
 CARD, CARD_TEXT = "card.yaml", "card.md"  # for programs, for people
+TRAINED = "trained or chosen"
 LISTS = ("trained_on", "chosen_on", "imus")  # of names, on a card
 
 
@@ -120,15 +122,28 @@ def select_scored_drives(
     if leave_out:
         kept = [d for d in drives if d.group not in set().union(*seen.values())]
         if not kept:
-            raise InputError("unseen=true leaves no drive: every recording was in the training of one of the models")
+            raise InputError(
+                "unseen=true leaves no drive: every recording was in the training of a model or its tuning"
+            )
         return kept, []
     return list(drives), [
-        describe_seen_recordings(name, len(which), len(groups), "unseen=true leaves them out")
+        describe_seen_recordings(
+            name, len(which), len(groups), "unseen=true leaves them out", cards[name].get("how", TRAINED)
+        )
         for name, which in seen.items()
         if which
     ]
 
 
-def describe_seen_recordings(name: str, seen: int, of: int, remedy: str) -> str:
+def card_of_tuning(models: Iterable[str], tuning: Tuning) -> dict[str, dict[str, Any]]:
+    """What the card of a learned filter has, of the noise of these Kalman filters; empty where nothing is known."""
+    names, fit = ", ".join(models), tuning.fitted_on
+    if not names or fit is None:
+        return {}
+    trained = {"trained_on": fit.recordings, "datasets": {fit.dataset: fit.digest}}
+    return {f"the tuning of {names}": trained | {"how": "fitted"}}
+
+
+def describe_seen_recordings(name: str, seen: int, of: int, remedy: str, how: str = TRAINED) -> str:
     """A line for a model that is scored on recordings of its training."""
-    return f"{name} was trained or chosen on {seen} of these {of} recordings, which flatters it; {remedy}"
+    return f"{name} was {how} on {seen} of these {of} recordings, which flatters it; {remedy}"

@@ -71,7 +71,7 @@ class LearnedKalmanConfig(LearnedConfig):
     def with_base(self, imu: ImuSpec, tuning: Tuning, prior: Prior | None) -> LearnedKalmanConfig:
         """With a Kalman filter's numbers."""
         known = {} if prior is None else asdict(prior)
-        return replace(self, imu=asdict(imu), tuning=asdict(tuning), prior=known)
+        return replace(self, imu=asdict(imu), tuning=tuning.factors(), prior=known)
 
     def kalman(self) -> Mbkf:
         """The Kalman filter; InputError for a base that is none."""

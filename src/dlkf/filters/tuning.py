@@ -3,9 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 
 from dlkf.base.errors import InputError
+
+
+@dataclass(frozen=True)
+class FittedOn:
+    """The recordings that factors were fitted on, of a dataset by its folder's name and the digest of its data."""
+
+    dataset: str
+    digest: str
+    recordings: Sequence[str]
 
 
 @dataclass(frozen=True)
@@ -24,6 +33,7 @@ class Tuning:
     file gives none, ``heading_std`` a factor on that of the heading.
     Filters with a gate: ``gate`` is the probability that a good fix passes. ``aekf``: ``forgetting`` is the share
     of the past in the adapted Q and R (0.3 in Akhlaghi et al. 2017, which lost wherever it was tried).
+    ``fitted_on`` has no effect on a filter: with the same factors it is the same tuning.
     """
 
     accel_noise: float = 1.0
@@ -47,14 +57,19 @@ class Tuning:
     baro_std: float = 0.5
     gate: float = 0.9999
     forgetting: float = 0.995
+    fitted_on: FittedOn | None = field(default=None, compare=False, repr=False)
 
     def __post_init__(self) -> None:
-        for f in fields(self):
-            if not getattr(self, f.name) > 0:
-                raise InputError(f"tuning: {f.name} is {getattr(self, f.name)!r}, must be above 0")
+        for name, value in self.factors().items():
+            if not value > 0:
+                raise InputError(f"tuning: {name} is {value!r}, must be above 0")
         for name in ("gate", "forgetting"):
             if not getattr(self, name) < 1:
                 raise InputError(f"tuning: {name} is {getattr(self, name)!r}, must be below 1")
+
+    def factors(self) -> dict[str, float]:
+        """Name → value of what a filter takes."""
+        return {f.name: getattr(self, f.name) for f in fields(self) if f.name != "fitted_on"}
 
 
 @dataclass(frozen=True)

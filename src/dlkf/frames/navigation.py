@@ -161,11 +161,12 @@ def load(
     factors = settings_from(Tuning, tuning_values(tuning), "tuning")
     model = check_model(model)
     check_imu_type(imu_type)
+    with in_python():
+        resolved = resolve_model(model, imu_spec(imu_values(imu_type)), tuning=factors)
     given = {"imu_type": imu_type, "tuning": tuning}
     if line := unused_settings(model, [name for name, value in given.items() if value != DEFAULT_NOISE[name]]):
         warnings.warn(line, UserWarning, stacklevel=count_calls())
-    with in_python():
-        return resolve_model(model, imu_spec(imu_values(imu_type)), tuning=factors)
+    return resolved
 
 
 def Stream(

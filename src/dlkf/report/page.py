@@ -130,7 +130,7 @@ def flatten_settings(values: Mapping[str, Any], depth: int = 0) -> list[tuple[in
 
 
 def format_setting(value: Any) -> str:
-    """A value for a reader: – for none, numbers with six digits at most."""
+    """A value for a reader: – for none, an empty list as none, numbers with six digits at most."""
     if value is None or (isinstance(value, Mapping) and not value):
         return "–"
     if isinstance(value, bool):
@@ -138,5 +138,5 @@ def format_setting(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:.6g}"
     if isinstance(value, (list, tuple)):
-        return ", ".join(map(format_setting, value)) or "–"
+        return ", ".join(map(format_setting, value)) or "none"
     return str(value)

@@ -12,7 +12,10 @@ from dlkf.evaluation.table import format_number
 from dlkf.tracking.runs import MONITORS, PARENT_TAG
 
 NAMELESS = ("tracking", "hydra", "resume", "name", "out")  # settings that do not affect the result
-COMPARED = ("outage_end_horizontal_m", "position_rms_m")  # the first that the children have
+COMPARED = {  # the first that the children have
+    "outage_end_horizontal_m": "Horizontal error at the end of the outages, RMS [m]",
+    "position_rms_m": "Position error, RMS [m]",
+}
 
 
 def children(client, parent: str) -> list:
@@ -74,10 +77,10 @@ def comparison(client, runs: Sequence) -> pd.DataFrame:
 
 
 def compare_children(table: pd.DataFrame) -> tuple[str, pd.DataFrame]:
-    """The metric to compare by, and run, status, validation and its value for every filter.
+    """The title, and run, status, validation and the metric that is compared for every filter.
 
-    Sorted by validation: test drives choose nothing (R018). Without ``test/`` metrics (all runs failed) the
-    name is empty.
+    Sorted by validation, of trainings: test drives choose nothing (R018). Without ``test/`` metrics (all runs failed)
+    the title says so.
     """
     monitor = next((c for c in map(str, table) if c.startswith("val/")), None)
     first = [c for c in ("run", "status", monitor) if c in table]
@@ -87,11 +90,12 @@ def compare_children(table: pd.DataFrame) -> tuple[str, pd.DataFrame]:
         if columns:
             break
     else:
-        return "", ordered[first]
+        return "No run was scored", ordered[first]
     names = {c: c.removeprefix("test/").removesuffix(f"/{metric}") for c in columns}
     trained = [c for c in columns if names[c].rpartition("/")[2].startswith("dlkf")]
     columns = trained + [c for c in columns if c not in trained]
-    return metric, ordered[[*first, *columns]].rename(columns=names)
+    title = COMPARED[metric] + ("; test segments, runs by their validation" if monitor else "")
+    return title, ordered[[*first, *columns]].rename(columns=names)
 
 
 def as_text(table: pd.DataFrame) -> str:

@@ -112,10 +112,7 @@ class GridParent(Callback):
 
     def _compare(self, client, parent: str, table: pd.DataFrame, failed: Sequence[Failure]) -> None:
         """The table of all points as text, CSV and note of the parent."""
-        metric, chosen = compare_children(table)
-        ordered = any(c.startswith("val/") for c in map(str, table))
-        title = f"{metric} of the test segments" if metric else "no run was scored"
-        title += "; runs by their validation" if ordered else ""
+        title, chosen = compare_children(table)
         text = as_text(chosen) + "".join(f"\nfailed: {f.point}: {f.why}\n" for f in failed)
         client.log_text(parent, table.to_csv(index=False), "comparison.csv")
         client.log_text(parent, text, "comparison.md")

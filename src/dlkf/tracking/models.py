@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from inspect import signature
 from pathlib import Path
 from typing import Any
@@ -114,13 +114,6 @@ def own_filter(spec: str, imu: ImuSpec) -> Estimator:
     """
     kind = find_class(spec, "model", ("begin", "step"))
     return kind(imu=imu) if "imu" in signature(kind).parameters else kind()
-
-
-def check_baseline(baseline: str, models: Mapping[str, Filter]) -> None:
-    """InputError for a baseline that is neither among the models nor a filter's name."""
-    if baseline not in models and not is_filter(str(baseline)):
-        near = did_you_mean(baseline, (*models, *filter_names())) or "; see model="
-        raise InputError(f"baseline={baseline} is none of the models {', '.join(models)}{near}")
 
 
 def is_tracked(spec: str) -> bool:

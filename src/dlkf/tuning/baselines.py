@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 from dlkf.data.drive import Batch
@@ -34,7 +34,7 @@ class Baselines:
         """Plain values for a report."""
         return {
             "imu": self.imu.name,
-            "tuning": {n: asdict(t) for n, t in self.tunings.items() if n != "ins"},
+            "tuning": {n: t.factors() for n, t in self.tunings.items() if n != "ins"},
             "prior": {n: {"mean": list(p.mean), "std": list(p.std)} for n, p in self.priors.items()},
         }
 

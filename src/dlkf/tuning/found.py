@@ -9,7 +9,7 @@ import yaml
 
 from dlkf.base.files import write_into
 from dlkf.evaluation.table import ResultTable, as_markdown, format_number
-from dlkf.filters.tuning import Tuning
+from dlkf.filters.tuning import FittedOn, Tuning
 from dlkf.navigation.imu_errors import NEEDED, ImuSpec
 from dlkf.running.likelihood import NO_OFFSET, NoiseFit
 
@@ -27,8 +27,9 @@ def noise_table(model: str, dataset: str, imu: ImuSpec, tuning: Tuning, found: N
     )
 
 
-def write_noise(out: str | Path, found: NoiseFit, table: ResultTable) -> list[str]:
+def write_noise(out: str | Path, found: NoiseFit, table: ResultTable, fitted_on: FittedOn) -> list[str]:
     """Write imu/<name>.yaml, tuning/<name>.yaml and table.md into ``out``, all or none; their names."""
+    factors = found.tuning.factors() | {"fitted_on": asdict(fitted_on)}
     name = found.imu.name
     usual = type(found.imu.accel)()
     sensors = {
@@ -37,7 +38,7 @@ def write_noise(out: str | Path, found: NoiseFit, table: ResultTable) -> list[st
     }
     preset = {"name": name, "source": found.imu.source, **sensors}
     with write_into(out) as folder:
-        for kind, values in (("imu", preset), ("tuning", asdict(found.tuning))):
+        for kind, values in (("imu", preset), ("tuning", factors)):
             (folder / kind).mkdir()
             text = f"# {table.title}\n{yaml.safe_dump(values, sort_keys=False)}"
             (folder / kind / f"{name}.yaml").write_text(text, encoding="utf-8")

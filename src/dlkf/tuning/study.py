@@ -21,7 +21,7 @@ from dlkf.evaluation.protocol import Protocol, Scenes, describe_short
 from dlkf.evaluation.summary import FEW
 from dlkf.evaluation.table import ResultTable, as_markdown, format_number
 from dlkf.filters.build import build_causal, has_prior, is_filter
-from dlkf.filters.tuning import Prior, Tuning
+from dlkf.filters.tuning import FittedOn, Prior, Tuning
 from dlkf.navigation.imu_errors import ImuSpec
 from dlkf.tuning.search import Trial, evaluate_objective, tune_under_bar
 
@@ -48,8 +48,8 @@ class TuningResult:
     @property
     def changed(self) -> dict[str, float]:
         """Settings that are not the defaults."""
-        start, default = asdict(self.after), asdict(Tuning())
-        return {k: v for k, v in start.items() if v != default[k]}
+        default = Tuning().factors()
+        return {k: v for k, v in self.after.factors().items() if v != default[k]}
 
     def metrics(self) -> dict[str, float]:
         """For a log: ``train/outage_rms/tuned``, ``test/pva/untuned`` and the like."""
@@ -179,9 +179,12 @@ def describe_compared(side: str, kind: str, count: int, drives: int) -> str:
     return many + (", too few to conclude from." if side == "test" and count < FEW else ".")
 
 
-def write_tuning(out: str | Path, name: str, result: TuningResult, table: ResultTable) -> list[str]:
+def write_tuning(
+    out: str | Path, name: str, result: TuningResult, table: ResultTable, fitted_on: FittedOn
+) -> list[str]:
     """Write tuning/<name>.yaml, table.md and search.csv into ``out``, all or none; their names."""
-    factors = f"# {table.title}\n{yaml.safe_dump(asdict(result.after), sort_keys=False)}"
+    values = result.after.factors() | {"fitted_on": asdict(fitted_on)}
+    factors = f"# {table.title}\n{yaml.safe_dump(values, sort_keys=False)}"
     trials = pd.DataFrame(result.trials, columns=["factor", "value", "objective"])
     with write_into(out) as folder:
         (folder / "tuning").mkdir()
