@@ -66,7 +66,9 @@ def outages(tables: CheckedTables, first: float, every: float, length: float) ->
     """Times of the last fix before each, of those with a valid reference at both ends."""
     t0, t1 = tables.imu["t"][[0, -1]]
     ref = tables.reference
-    for begin in np.arange(t0 + first, t1 - length, every) if ref is not None else ():
+    if ref is None:
+        return
+    for begin in np.arange(t0 + first, t1 - length, every):
         k = np.searchsorted(ref["t"], (begin, begin + length))
         if ref["valid"][np.minimum(k, len(ref["t"]) - 1)].all():
             yield float(begin)
@@ -92,7 +94,8 @@ def main() -> None:
     for folder in o.datasets:
         drives = [read_drive(folder, row) for row in drive_rows(folder)]
         for model in o.models:
-            library = compile_filter(load(model), 50.0, 1.0, whole=True).library
+            tuning = "untuned" if model.startswith("plus") else "any_car"
+            library = compile_filter(load(model, tuning=tuning), 50.0, 1.0, whole=True).library
             for gap in o.gaps:
                 rows = [
                     run(Core(library.path, x.row.lever_arm_b), x, begin, gap, o.first, o.length)

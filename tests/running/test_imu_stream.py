@@ -27,7 +27,7 @@ def _fed(stream: ImuStream, t: np.ndarray, x: np.ndarray, phase: float) -> np.nd
         if stream.grid is None and stamp > t[0] + 3:
             stream.begin(np.array([phase]))
         done += stream.close_epochs()
-    return np.concatenate(done + stream.close_epochs(ended=True))
+    return np.concatenate([x.imu for x in done + stream.close_epochs(ended=True)])
 
 
 @pytest.mark.parametrize("t0", [0.0, 1.7e9])

@@ -66,8 +66,8 @@ def check_frozen(imu: Columns, gnss: Columns, where: str) -> None:
         if (end - begin > FROZEN_IMU_S).any() and (stuck := _find_stuck(imu[name], t, begin, end, fixes)) is not None:
             first, last = stuck
             raise InputError(
-                f"{where}: {name} stays {imu[name][np.searchsorted(t, first)]:g} from t = {first:.3f} to {last:.3f} "
-                f"while the car moves and other axes change: a stuck axis; {remedy}"
+                f"{where}: {name} stays at {imu[name][np.searchsorted(t, first)]:g} from t = {first:.3f} to {last:.3f} "
+                f"while the car moves and other axes change: stuck or saturated; {remedy}"
             )
 
 

@@ -196,6 +196,7 @@ class PlusFilter(nn.Module):
         offered = memory.fix_noise.inflate_fix(claimed)
         kalman, epoch = self.kalman.screen_fix(memory.kalman, offered)
         wander = memory.errors.variance(offered), offered.used[:, POSITION].any(-1), self.states, span
+        assert kalman.parameters is not None
         slow = select_slow_errors(kalman.parameters, self.states)
         outage = memory.outage.let_wander(*wander)
         memory = memory._replace(kalman=kalman._replace(P=let_wander(kalman.P, *wander)), outage=outage)

@@ -5,7 +5,7 @@ and velocity of the antenna at t − d (:func:`dlkf.navigation.error_model.anten
 and beyond its ends with the acceleration a there. H has −v_a and −a for δd (zero below ``MOVING``, where v_a is mostly
 the filter's own error, which is in the innovation too), C and C [ω×] for δl, with v_a the velocity of the antenna, and
 λ + d for the age of the fix. a is the change of velocity over ``SLOPE_S`` to either side, inside
-the window: a mean over all of it lags in turns, and the delay seems too certain. A
+the window: a mean over all of it lags when the car turns, and the delay seems too certain. A
 receiver's clock that is fast by r against that of the IMU makes the delay grow, ḋ = r (:func:`let_delay_grow`). A
 filter with the source ``+receiver`` (:class:`dlkf.filters.aids.receiver.Receiver`) estimates d, δl and r.
 """
@@ -87,6 +87,7 @@ def add_columns(H: Float[Tensor, "B 6 n"], epoch: Epoch, states: ErrorStates) ->
     """H with the columns of delay and antenna, for an epoch of :func:`predict_fix`."""
     H, C, k = H.clone(), epoch.at_fix.C_nb, states.of(ARM[0]).start
     v = antenna(epoch.at_fix, epoch.rate_at_fix_b, epoch.lever_arm_b, epoch.frame)[:, 3:]
+    assert epoch.fix.lag is not None
     moves, a = v.norm(dim=-1, keepdim=True) > MOVING, _acceleration(epoch, epoch.fix.lag)
     H[:, :, states.of(DELAY).start] = torch.where(moves, -torch.cat((v, a), -1), 0.0)
     H[:, :, k : k + 3] = torch.cat((C, C @ skew(epoch.rate_at_fix_b)), 1)

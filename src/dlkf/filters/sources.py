@@ -149,7 +149,7 @@ def _look_back(H: Float[Tensor, "B 6 n"], epoch: Epoch, lag: Float[Tensor, " B"]
     H, lag = H.clone(), lag[:, None, None]
     end = epoch.window.end
     gained = end.v_n - epoch.at_fix.v_n - lag[:, 0] * epoch.window.gravity
-    H[..., GYRO] += lag * (H[..., ATTITUDE] @ end.C_nb)
+    H[..., GYRO] += lag * (H[..., ATTITUDE].clone() @ end.C_nb)
     tilt = skew(gained)
     turned = 0.5 * lag * (tilt @ end.C_nb)
     columns = torch.cat((tilt, lag * end.C_nb, turned), -1)

@@ -237,6 +237,8 @@ def _find_registered(client: MlflowClient, spec: str, uri: str) -> str:
         if error.error_code != "RESOURCE_DOES_NOT_EXIST":
             raise
         known = ", ".join(m.name for m in client.search_registered_models(max_results=20)) or "none"
+        if known == "none":
+            known += "; run from the folder of the training or give tracking.uri=…"
         raise InputError(f"model={spec}: {uri} has no model {name!r}; known: {known}") from None
     if alias:
         if alias not in aliases:
