@@ -11,4 +11,4 @@ def claimed(monkeypatch) -> None:
     monkeypatch.setattr(fix_noise.FixNoise, "inflate_fix", lambda self, epoch: epoch)
     monkeypatch.setattr(position_errors, "WANDER", 0.0)
     monkeypatch.setattr(position_errors.PositionErrors, "noise", lambda self, epoch, std: std.new_ones(1, 4))
-    monkeypatch.setattr(position_errors.PositionErrors, "add_slow_std", lambda self, std, known: std)
+    monkeypatch.setattr(position_errors.PositionErrors, "add_slow_std", lambda self, std: std)

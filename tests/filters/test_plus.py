@@ -7,8 +7,6 @@ import torch
 
 from dlkf.base.errors import InputError
 from dlkf.data.augmentation import turn_frames
-from dlkf.filters.aids.attach import add_sources
-from dlkf.filters.aids.receiver import SlowErrors
 from dlkf.filters.build import build_filter
 from dlkf.filters.constraints import CarConstraints
 from dlkf.filters.integration import integrate
@@ -35,7 +33,7 @@ def plus(base="mbkf21_car", weights: float = 0.0, hidden: int = 16) -> PlusFilte
 
 def classical(base: str, model: PlusFilter):
     """Its classical filter."""
-    kalman = add_sources(build_filter(base, model.imu, tuning=model.tuning), [SlowErrors])
+    kalman = build_filter(base, model.imu, tuning=model.tuning)
     sources = tuple(replace(s, adapts_noise=True) if isinstance(s, CarConstraints) else s for s in kalman.sources)
     return replace(kalman, sources=sources, heavy_tails=True)
 
@@ -64,8 +62,7 @@ def test_before_the_first_fix_it_is_the_classical_filter_to_the_bit():
     available[:, :9] = False
     batch = replace(batch, available=available)
     with torch.no_grad():
-        base = add_sources(build_filter("mbkf21_car", model.imu, tuning=model.tuning), [SlowErrors])
-        a, b = integrate(batch, model), integrate(batch, base)
+        a, b = integrate(batch, model), integrate(batch, build_filter("mbkf21_car", model.imu, tuning=model.tuning))
     assert torch.equal(a.posterior.p_n[:, :9], b.posterior.p_n[:, :9]) and torch.equal(a.std[:, :9], b.std[:, :9])
     assert not torch.equal(a.posterior.p_n[:, 12], b.posterior.p_n[:, 12])
 

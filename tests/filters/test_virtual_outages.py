@@ -5,8 +5,6 @@ from dataclasses import replace
 
 import torch
 
-from dlkf.filters.aids.attach import add_sources
-from dlkf.filters.aids.receiver import SlowErrors
 from dlkf.filters.build import build_filter
 from dlkf.filters.integration import integrate
 from dlkf.filters.plus import ANY_MEMS, PlusConfig, PlusFilter
@@ -136,8 +134,7 @@ def test_plus_takes_over_the_levels(claimed):
     batch = scene(2, 110, seed=8, noise=False)
     batch = replace(batch, available=(torch.arange(110) < 95).expand(2, -1))
     with torch.inference_mode():
-        base = add_sources(build_filter("mbkf21", model.imu, tuning=model.tuning), [SlowErrors])
-        a, b = integrate(batch, model), integrate(batch, base)
+        a, b = integrate(batch, model), integrate(batch, build_filter("mbkf21", model.imu, tuning=model.tuning))
     assert torch.equal(a.std[:, : int(SCORED_S)], b.std[:, : int(SCORED_S)])
     assert (a.std[:, -1, :2] < 0.85 * b.std[:, -1, :2]).all()
     assert LEVELS[0] < 1 / 8

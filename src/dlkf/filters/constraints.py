@@ -31,11 +31,10 @@ from torch import Tensor
 from dlkf.data.drive import Batch
 from dlkf.filters.constraint_noise import ConstraintNoise
 from dlkf.filters.integration import Epoch
-from dlkf.filters.slow_errors import join_slow_errors
 from dlkf.filters.sources import Measurement, Predicted, predicted_variance
 from dlkf.filters.stationarity import VibrationLevel, WheelMotion, detect_stationary
 from dlkf.filters.tuning import Tuning
-from dlkf.navigation.state import GYRO, STATES, VELOCITY, ErrorStates
+from dlkf.navigation.state import GYRO, POSITION, STATES, VELOCITY, ErrorStates
 
 STRUCTURE_STD = (0.05, 0.05, 1.5, 0.01, 0.005)  # rad, rad, m, s²/m, s²·rad/m: what is known of a car before it moves
 STRUCTURE_WALK_STD = (2e-5, 2e-5, 1e-4, 1e-6, 1e-6)  # per √s
@@ -93,7 +92,7 @@ class CarConstraints:
             variance = torch.cat((noise.factor * variance[:, :2], variance[:, 2:]), -1)
         S = of_state + variance[:, :2]
         if noise is not None:
-            learns = used[:, 0] & _is_near_fix(epoch, join_slow_errors(prediction.P, self.states))
+            learns = used[:, 0] & _is_near_fix(epoch, prediction.P)
             noise = noise.update(zn, of_state, a_second, OUTLIER, learns)
         variance = torch.cat((variance[:, :2] * (zn.square() / (OUTLIER**2 * S)).clamp_min(1.0), variance[:, 2:]), -1)
         z = torch.cat((zn, zr), -1) * used
@@ -151,10 +150,10 @@ class CarConstraints:
 
 
 def _is_near_fix(epoch: Epoch, P: Float[Tensor, "B n n"]) -> Bool[Tensor, " B"]:
-    """Whether the window has a fix whose horizontal position is within 3σ of the filter's, of any axis on average."""
-    S = P.diagonal(dim1=-2, dim2=-1)[:, :2] + epoch.fix.std[:, :2].square()
-    near = epoch.z[:, :2].square().sum(-1) < OUTLIER**2 * S.mean(-1)
-    return epoch.used[:, :2].all(-1) & near
+    """Whether the window has a fix whose horizontal position is within 3σ of the filter's."""
+    S = P.diagonal(dim1=-2, dim2=-1)[:, POSITION] + epoch.fix.std[:, POSITION].square()
+    near = epoch.z[:, POSITION].square() < OUTLIER**2 * S
+    return (epoch.used[:, POSITION] & near)[:, :2].all(-1)
 
 
 @lru_cache

@@ -21,17 +21,6 @@ from dlkf.filters.heavy_tails import HeavyTails
 from dlkf.filters.integration import Correction, Covariances, Epoch, Estimator
 from dlkf.filters.kalman_update import kalman_prediction, kalman_update
 from dlkf.filters.receiver import add_drift, has_receiver, let_delay_grow, predict_fix, widen_start
-from dlkf.filters.slow_errors import (
-    decay,
-    decay_estimates,
-    has_slow_errors,
-    join_slow_errors,
-    let_decay,
-    of_slow_errors,
-    predict_slow_errors,
-    select_slow_errors,
-    split_start,
-)
 from dlkf.filters.sources import (
     FixMemory,
     GnssFix,
@@ -172,8 +161,6 @@ class Mbkf:
         P, fix = torch.diag_embed(sigma**2), self.fix.begin(batch)
         if has_receiver(self.states) and batch.start_noise is not None:  # a start that was found from fixes
             P = widen_start(P, batch.start, self.states)
-        if has_slow_errors(self.states) and batch.start_noise is not None:
-            P = split_start(P, self.states)
         tails = None
         if self.heavy_tails and self.states.elements:
             tails = HeavyTails.begin(self._imu_sigma().to(**like).expand(B, -1), self.states)
@@ -216,29 +203,21 @@ class Mbkf:
             return torch.where(rejected, predicted_variance(c.predicted, H) + R, 0.0)
 
     def advance_delay(self, memory: KalmanMemory, seconds: float) -> KalmanMemory:
-        """At the end of an update interval, as far as the fix is concerned: delay and slow errors are others."""
-        P, parameters = memory.P, memory.parameters
-        if parameters is not None and has_receiver(self.states):
-            P, parameters = let_delay_grow(P, parameters, self.states, seconds)
-        if parameters is not None and has_slow_errors(self.states):
-            P, parameters = let_decay(P, self.states, seconds), decay_estimates(parameters, self.states, seconds)
-        return memory if parameters is memory.parameters else memory._replace(P=P, parameters=parameters)
+        """At the end of an update interval, as far as the fix is concerned: its delay has grown."""
+        if memory.parameters is None or not has_receiver(self.states):
+            return memory
+        P, parameters = let_delay_grow(memory.P, memory.parameters, self.states, seconds)
+        return memory._replace(P=P, parameters=parameters)
 
     def predict_fix(self, memory: KalmanMemory, epoch: Epoch) -> Epoch:
-        """The epoch with the innovation that delay, antenna and slow errors give, where the filter estimates them."""
-        if memory.parameters is None:
+        """The epoch with the innovation that delay and antenna give, where the filter estimates them."""
+        if memory.parameters is None or not has_receiver(self.states):
             return epoch
-        if has_receiver(self.states):
-            epoch = predict_fix(epoch, self._name_parameters(memory))
-        if has_slow_errors(self.states):
-            epoch = predict_slow_errors(epoch, select_slow_errors(memory.parameters, self.states))
-        return epoch
+        return predict_fix(epoch, self._name_parameters(memory))
 
     def screen_fix(self, memory: KalmanMemory, epoch: Epoch) -> tuple[KalmanMemory, Epoch]:
         """Memory and epoch after the gate of its fixes."""
-        joined = join_slow_errors(memory.P, self.states)
-        fix, epoch, P = self.fix.screen_fix(memory.fix, epoch, joined, memory.noise)
-        P = P if joined is memory.P else memory.P + (P - joined)
+        fix, epoch, P = self.fix.screen_fix(memory.fix, epoch, memory.P, memory.noise)
         return memory if fix is memory.fix else memory._replace(P=P, fix=fix), epoch
 
     def update(self, memory: KalmanMemory, epoch: Epoch) -> tuple[KalmanMemory, Correction]:
@@ -296,10 +275,6 @@ class Mbkf:
             said += [parameters, P.diagonal(dim1=-2, dim2=-1)[:, self.states.of_others].clamp_min(0).sqrt()]
         if has_receiver(self.states):
             Phi = add_drift(Phi, self.states, epoch.dt * epoch.imu.shape[1])
-        if has_slow_errors(self.states):
-            slow = of_slow_errors(self.states)
-            Phi = Phi.clone()
-            Phi[:, slow, slow] *= decay(epoch.dt * epoch.imu.shape[1])
         memory = KalmanMemory(P, memory.windows, memory.fix, tuple(sources), structure, noise, parameters, tails)
         error = epoch.error.update(dx, self.states)
         if parameters is not None and has_g_sensitivity(self.states):

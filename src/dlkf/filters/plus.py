@@ -26,8 +26,6 @@ from dlkf.base.errors import InputError
 from dlkf.base.settings import settings_from
 from dlkf.data.drive import Batch
 from dlkf.filters.advice import NetworkOutput
-from dlkf.filters.aids.attach import add_sources
-from dlkf.filters.aids.receiver import SlowErrors
 from dlkf.filters.branches import may_branch
 from dlkf.filters.build import build_filter
 from dlkf.filters.constraints import CarConstraints
@@ -44,13 +42,6 @@ from dlkf.filters.matching import (
 from dlkf.filters.model_based import KalmanMemory as KalmanMemory
 from dlkf.filters.model_based import Mbkf
 from dlkf.filters.position_errors import PositionErrors
-from dlkf.filters.slow_errors import (
-    join_slow_errors,
-    leave_out_slow_errors,
-    let_wander,
-    of_slow_errors,
-    select_slow_errors,
-)
 from dlkf.filters.tuning import Tuning
 from dlkf.filters.virtual_outages import VirtualOutage
 from dlkf.navigation.calibration import ImuError
@@ -137,7 +128,6 @@ class PlusFilter(nn.Module):
             raise InputError(
                 f"model.base={config.base} is no Kalman filter that plus can stand on; take {PlusConfig.base}"
             )
-        kalman = add_sources(kalman, [SlowErrors])
         sources = tuple(replace(s, adapts_noise=True) if isinstance(s, CarConstraints) else s for s in kalman.sources)
         self.kalman = replace(kalman, sources=sources, cut_transition=True, heavy_tails=True)
         count = self.kalman.states.base.count
@@ -195,11 +185,9 @@ class PlusFilter(nn.Module):
         claimed = self.kalman.predict_fix(memory.kalman, epoch)
         offered = memory.fix_noise.inflate_fix(claimed)
         kalman, epoch = self.kalman.screen_fix(memory.kalman, offered)
-        wander = memory.errors.variance(offered), offered.used[:, POSITION].any(-1), self.states, span
-        assert kalman.parameters is not None
-        slow = select_slow_errors(kalman.parameters, self.states)
-        outage = memory.outage.let_wander(*wander)
-        memory = memory._replace(kalman=kalman._replace(P=let_wander(kalman.P, *wander)), outage=outage)
+        walk = torch.diag_embed(memory.errors.variance(offered))
+        outage = memory.outage._replace(P=_add_walk(memory.outage.P, walk))
+        memory = memory._replace(kalman=kalman._replace(P=_add_walk(kalman.P, walk)), outage=outage)
         fixed = epoch.used.any(-1)
         with torch.no_grad():
             normalised = self._normalise_innovation(memory, epoch)
@@ -235,12 +223,10 @@ class PlusFilter(nn.Module):
                 scale = source_scale(of_network, epoch.start.C_nb)
                 outage = outage.update(epoch, c, memory.kalman.windows, scale)
                 offering = c._replace(H=self.kalman.fix.matrix(claimed))  # before the gate
-                fix_noise = fix_noise.update(claimed, offering, outage)
-                errors = errors.update(*leave_out_slow_errors(offered, offering, slow, self.states))
+                errors, fix_noise = errors.update(offered, offering), fix_noise.update(claimed, offering, outage)
                 matching = matching.update_ratios(c.dx, c.predicted, c.updated, epoch.window.end.C_nb, fixed)
         if correction.std is not None:
-            known = kalman.P.diagonal(dim1=-2, dim2=-1)[:, of_slow_errors(self.states)]
-            correction = correction._replace(std=errors.add_slow_std(correction.std, known))
+            correction = correction._replace(std=errors.add_slow_std(correction.std))
         correction = correction._replace(innovation=claimed.z, rejected=rejected)
         return memory._replace(
             kalman=kalman, hidden=hidden, matching=matching, outage=outage, errors=errors, fix_noise=fix_noise,
@@ -250,8 +236,7 @@ class PlusFilter(nn.Module):
     def _normalise_innovation(self, memory: PlusMemory, epoch: Epoch) -> Float[Tensor, "B 6"]:
         """Innovations over their 1σ as the filter of the last epoch has it, in heading axes; zero without a fix."""
         C_hn = level_rotation(epoch.window.end.C_nb, "heading")
-        P = join_slow_errors(memory.kalman.P, self.states)
-        return normalised_innovation(P, epoch.z, epoch.fix.std, C_hn, 1e-4)
+        return normalised_innovation(memory.kalman.P, epoch.z, epoch.fix.std, C_hn, 1e-4)
 
     def _features(
         self, memory: PlusMemory, epoch: Epoch, normalised: Float[Tensor, "B 6"], bands: Float[Tensor, "B K"],
@@ -292,6 +277,13 @@ class PlusFilter(nn.Module):
         return like.new_tensor(
             (1.0,) * 3 + (0.3,) * 3 + (0.02,) * 3 + (0.1,) * 3 + (0.005,) * 3 + (0.005,) * matrix + car
         )
+
+
+def _add_walk(P: Float[Tensor, "B n n"], walk: Float[Tensor, "B 3 3"]) -> Float[Tensor, "B n n"]:
+    """P after a random walk of the position."""
+    P = P.clone()
+    P[:, POSITION, POSITION] += walk
+    return P
 
 
 def _to_plain(values: Mapping[str, Any]) -> dict[str, Any]:

@@ -1,24 +1,24 @@
 """Errors of a receiver's positions: which part of its 1σ is white, and how fast the rest moves.
 
 A receiver's 1σ covers all of an error; multipath, orbits and atmosphere change over tens of seconds. A filter that
-treats that part as white noise averages over it and becomes overconfident. Other receivers claim ten times the error
-that they have. With the innovation z of a fix, slow errors not taken off, and the residual r = z − H dx of the one
-before after its update, the error has changed by
+treats that part as white noise averages over it and becomes overconfident in its velocity. Other receivers claim ten
+times the error that they have. With the innovation z of a fix and the residual r = z − H dx of the one before after
+its update, the error has changed by
 
     u = (zₖ − rₖ₋₁) / σ,
 
 σ as it is in force (:mod:`dlkf.filters.fix_noise`), and by what the filter's velocity is off. White noise of variance
 w beside a walk of variance q per interval, in units of σ², has E[uₖ²] = 2 w + q + P_v Δt² / σ² and E[uₖ uₖ₋₁] = −w,
 so running means of both products give w and q. Of few fixes the mean of u²/2 is far less scattered; it is no smaller
-than w and limits it, so a receiver that claims ten times its error is known after a few fixes. What is not white is a
-Gauss-Markov process of correlation time ``WANDER_S``, three states of the filter (:mod:`dlkf.filters.slow_errors`),
-driven by q; q is at most the share 1 − w of what such a process of 1σ ``WANDER`` σ moves by in Δt, 2 Δt / ``WANDER_S``
-of its variance.
+than w and limits it, so a receiver that claims ten times its error is known after a few fixes. What is not white may
+wander: q is at most the share 1 − w of what a Gauss-Markov process of 1σ ``WANDER`` σ and correlation time
+``WANDER_S`` moves by in Δt, 2 Δt / ``WANDER_S`` of its variance.
 
-The noise of a fix is w where that is less than claimed. It rises at once where the last changes are larger (``QUICK``
-fixes). Fixes of a stationary car count only where the carrier phase gives them: other receivers hold their position
-then. Horizontal and vertical errors have means of their own. Of an error that is not white and that hardly moves
-the process has less than is claimed: the 1σ of a position has the rest beside the filter's own.
+The noise of a fix is half the mean square by which the error changes in ``NOISE_S``, w + q ``NOISE_S`` / (2 Δt), where
+that is less than claimed; what moves slower is a wander of the position. It rises at once where the last changes are
+larger (``QUICK`` fixes). Fixes of a stationary car count only where the carrier phase gives them: other receivers hold
+their position then. Horizontal and vertical errors have means of their own. The 1σ of a position has the part that is
+not white beside the filter's own.
 """
 
 from __future__ import annotations
@@ -30,15 +30,15 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dlkf.filters.integration import Covariances, Epoch
-from dlkf.filters.slow_errors import WANDER_S
 from dlkf.filters.stationarity import CARRIER_STD
 from dlkf.navigation.state import POSITION, VELOCITY
 
-WANDER = 2.0  # σ of slow errors, at most
+WANDER, WANDER_S = 2.0, 40.0  # σ, s
 USUAL_FIXES = 20.0  # that white noise as claimed counts for before anything is known
 FEW_FIXES = 3.0  # the same of the mean square alone
 MEMORY, QUICK = 300.0, 10.0  # fixes
 LARGEST = 5.0  # σ: the most that a change of the error counts
+NOISE_S = 4.0  # an error that takes longer to change is no noise
 MOVING = 1.0  # m/s: slower cars are left out, but for receivers of ``CARRIER_STD``
 LEAST_STD = 0.02  # m, the least 1σ of a fix that is made smaller than claimed
 PART = [0, 0, 1]  # of a position's components: horizontal, vertical
@@ -77,19 +77,20 @@ class PositionErrors(NamedTuple):
     def noise(self, epoch: Epoch, position_std: Float[Tensor, ""]) -> Float[Tensor, "B 4"]:
         """Factors on the 1σ of position, horizontal and down, and of velocity (1), of a filter that takes positions
         for ``position_std`` times as noisy as claimed."""
-        factor = torch.maximum(self.white_share, 0.5 * self.recent).clamp_min(1e-6).sqrt()
+        intervals = NOISE_S / (epoch.dt * epoch.imu.shape[1])
+        slow = self.white_share + 0.5 * intervals * self.walk.clamp_min(0.0)
+        factor = torch.maximum(slow, 0.5 * self.recent).clamp_min(1e-6).sqrt()
         least = LEAST_STD / (position_std * epoch.fix.std[:, [0, 2]]).clamp_min(LEAST_STD)
         factor = torch.maximum(factor, least).clamp_max(1.0)
         return torch.cat((factor, torch.ones_like(factor)), -1)
 
-    def add_slow_std(self, std: Float[Tensor, "B k"], known: Float[Tensor, "B 3"]) -> Float[Tensor, "B k"]:
-        """1σ of the states with the errors of positions that change too slowly to be seen, beside those of variance
-        ``known`` in the states of slow errors: no filter averages them."""
-        position = (std[:, POSITION].square() + (self.slow - known).clamp_min(0)).sqrt()
+    def add_slow_std(self, std: Float[Tensor, "B k"]) -> Float[Tensor, "B k"]:
+        """1σ of the states with that of the position by which the receiver is off for long: no filter averages it."""
+        position = (std[:, POSITION].square() + self.slow).sqrt()
         return torch.cat((position, std[:, POSITION.stop :]), -1)
 
     def update(self, epoch: Epoch, c: Covariances) -> PositionErrors:
-        """After an update of the filter; innovation and H are those without the states of slow errors."""
+        """After an update of the filter."""
         used = epoch.used[:, POSITION]
         z = epoch.z[:, POSITION]
         std = torch.where(used, epoch.fix.std[:, POSITION], 1.0)

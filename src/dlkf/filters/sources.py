@@ -40,7 +40,6 @@ from dlkf.filters.adaptive import AdaptiveNoise
 from dlkf.filters.gating import CoarseMemory, FixGate, GateMemory
 from dlkf.filters.integration import Epoch
 from dlkf.filters.receiver import add_columns, has_receiver
-from dlkf.filters.slow_errors import add_slow_columns, has_slow_errors
 from dlkf.filters.tuning import Tuning
 from dlkf.navigation.attitude import skew
 from dlkf.navigation.error_model import mask_rows, measurement_matrix
@@ -208,6 +207,4 @@ class GnssFix:
         H = measurement_matrix(epoch.at_fix, epoch.rate_at_fix_b, epoch.lever_arm_b, epoch.frame, self.states.count)
         if epoch.fix.lag is not None:
             H = _look_back(H, epoch, epoch.fix.lag)
-        if has_slow_errors(self.states):
-            H = add_slow_columns(H, self.states)
         return add_columns(H, epoch, self.states) if has_receiver(self.states) else H

@@ -25,15 +25,14 @@ import math
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from dlkf.filters.branches import may_branch, select_branch
 from dlkf.filters.integration import Covariances, Epoch
 from dlkf.filters.kalman_update import propagate_covariance
-from dlkf.filters.slow_errors import decay, let_decay, let_wander, of_slow_errors
 from dlkf.navigation.error_model import WindowModel
-from dlkf.navigation.state import ATTITUDE, PVA, STATES, ErrorStates
+from dlkf.navigation.state import ATTITUDE, PVA, STATES
 
 SCORED_S, LAST_S, STALE_S = 10.0, 30.0, 45.0  # ages at which an outage is scored: each multiple up to the last; too old
 MEMORY_S = 600.0  # of fixes, over which an outage is forgotten
@@ -74,15 +73,6 @@ class VirtualOutage(NamedTuple):
         mean = torch.stack(((of_both.sum(2) * x).sum(1), (of_both.sum(1) * x).sum(1)), -1) / total.unsqueeze(-1)
         said = self.evidence.abs().flatten(1).amax(1, keepdim=True) > 0
         return torch.where(said, torch.exp(mean), 1.0), p[:, 0].sum((1, 2)) / total
-
-    def let_wander(
-        self, variance: Float[Tensor, "B 3"], fixed: Bool[Tensor, " B"], states: ErrorStates, seconds: float
-    ) -> VirtualOutage:
-        """The trajectory's part in the slow errors of the fixes after so long (:mod:`dlkf.filters.slow_errors`)."""
-        P = let_wander(let_decay(self.P, states, seconds), variance, fixed, states, seconds)
-        drift = self.drift.clone()
-        drift[:, of_slow_errors(states)] *= decay(seconds)
-        return self._replace(P=P, drift=drift)
 
     def update(
         self, epoch: Epoch, c: Covariances, windows: WindowModel, scale: Float[Tensor, "B 4 3 3"]

@@ -31,7 +31,6 @@ COLUMNS = {  # of a row, at the IMU; before the last part of a name that is an a
     "lever_forward_m": "antenna further forward than the lever arm says [m]",
     "lever_right_m": "antenna further to the right than the lever arm says [m]",
     "lever_down_m": "antenna further down than the lever arm says [m]",
-    **{f"fix_error_{x}_m": f"slow error of fixes {x} [m]" for x in ("north", "east", "down")},
 }
 SENSOR = {  # of a further sensor, after its name
     "_innovation": "sample of the sensor {} less expected, in its unit",

@@ -27,7 +27,6 @@ from dlkf.filters.aids.estimates import describe_estimate
 from dlkf.filters.constraints import CarConstraints
 from dlkf.filters.integration import BatchSolution, WholeLoop
 from dlkf.filters.receiver import ARM, DELAY, DRIFT
-from dlkf.filters.slow_errors import NAMES as SLOW
 from dlkf.filters.smoother import Filter, SmoothedSolution
 from dlkf.navigation.compiled import without_loops
 from dlkf.running.batched import CHUNK_SAMPLES, pack, run_filter
@@ -40,8 +39,7 @@ from dlkf.running.start.entry import SLACK_S, SLOWEST_FIXES_S, SLOWEST_START_S
 FEW_DRIVES = 8  # whose start in tensor operations takes less than numba takes to load
 WORTH_SAYING = 0.01  # probability of another heading
 SIGMAS = 3.0  # what differs from what a log says by so many 1σ is worth saying
-# s, m, ppm: 1σ of what no model of a car contains; what wanders is not said of the end of a drive
-OF_RECEIVER = {DELAY: 0.01, **dict.fromkeys(ARM, 0.1), DRIFT: 30.0, **dict.fromkeys(SLOW, np.inf)}
+OF_RECEIVER = {DELAY: 0.01, **dict.fromkeys(ARM, 0.1), DRIFT: 30.0}  # s, m, ppm: 1σ of what no model of a car contains
 SAMPLES_AT_ONCE = CHUNK_SAMPLES  # IMU samples of drives in memory, 8 h at 50 Hz
 FASTER_THAN_REVERSE = 8.0  # m/s
 VIBRATION = "vibration_speed"

@@ -8,7 +8,6 @@ from typing import NamedTuple
 
 from dlkf.filters.g_sensitivity import NAMES
 from dlkf.filters.receiver import ARM, DELAY, DRIFT
-from dlkf.filters.slow_errors import NAMES as SLOW
 
 DEGREES, G = 180 / math.pi, 9.80665
 DIGITS = 2  # of 1σ
@@ -31,7 +30,6 @@ ESTIMATES: Mapping[str, Readable] = {
     DELAY: Readable("Delay of fixes", "ms", 1000.0),
     **{name: Readable(f"Antenna further {name.split('_')[1]}", "m") for name in ARM},
     DRIFT: Readable("Clock drift", "ppm"),
-    **{name: Readable(f"Slow error {name.split('_')[2]}", "m") for name in SLOW},
     **{name: Readable("g-sensitivity " + " ".join(name.split("_")[-2:]), "°/s/g", DEGREES * G) for name in NAMES},
 }
 

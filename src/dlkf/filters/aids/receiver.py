@@ -1,4 +1,4 @@
-"""The states of :mod:`dlkf.filters.receiver` as a source, ``+receiver``, and those of slow errors of its positions."""
+"""The states of :mod:`dlkf.filters.receiver` as a source, ``+receiver``."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from typing import ClassVar
 
 from dlkf.filters.receiver import ARM, DELAY, DRIFT
-from dlkf.filters.slow_errors import NAMES
 from dlkf.filters.sources import Parameter, SensorSource
 
 
@@ -18,9 +17,3 @@ class Receiver(SensorSource):
         **{name: Parameter(std=0.2, largest=2.0) for name in ARM},
         DRIFT: Parameter(std=100.0, walk=0.1, largest=1000.0),
     }
-
-
-class SlowErrors(SensorSource):
-    """Slow errors of the positions (:mod:`dlkf.filters.slow_errors`); the rows of the fix contain them."""
-
-    parameters: ClassVar[Mapping[str, Parameter]] = dict.fromkeys(NAMES, Parameter(std=0.0))
