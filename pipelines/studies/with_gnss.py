@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from pipelines.studies.plus import load
 
+from dlkf.base.errors import InputError
 from dlkf.data.segments import whole_drives
 from dlkf.filters.integration import integrate
 from dlkf.frames import navigation
@@ -45,7 +46,10 @@ def main() -> None:
             filter_ = compile_filter(navigation.load(model, tuning=tuning), drives[0].rate_hz, drives[0].epoch_s)
             errors = []
             for drive in drives:
-                batch = whole_drives([drive], align_each([drive]))
+                (start,) = align_each([drive])
+                if isinstance(start, InputError):
+                    raise start
+                batch = whole_drives([drive], [start])
                 off = integrate(batch, filter_).posterior.p_n - batch.truth.p_n
                 of_body = (batch.truth.C_nb.mT @ off.unsqueeze(-1)).squeeze(-1)[0]
                 errors.append(torch.where(batch.truth_valid[0, :, None], of_body, torch.nan).numpy())
