@@ -88,7 +88,8 @@ def test_further_sensors_are_taken(drive):
     wheel = pd.DataFrame({"t": fixes.t, "speed": np.hypot(fixes.vel_n, fixes.vel_e)})
     solution = dlkf.navigate(drive["imu"], fixes, model="mbkf21_nhc", speed=wheel)
     assert solution["speed_used"].sum() > 20 and "wheel scale error" in solution.summary
-    assert "speed_used" not in dlkf.navigate(drive["imu"], fixes, model="mbkf15", speed=wheel)
+    with pytest.warns(UserWarning, match="used by no filter here"):
+        assert "speed_used" not in dlkf.navigate(drive["imu"], fixes, model="mbkf15", speed=wheel)
 
 
 def test_a_sensor_that_the_filter_does_not_use_is_named(drive):
