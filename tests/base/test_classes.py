@@ -120,6 +120,7 @@ HOOK = "# @package _global_\nhydra: {callbacks: {x: {_target_: pathlib.Path.touc
         ("&a [*a]", "aliases"),
         (BOMB, "aliases"),
         (HOOK, "found.yaml: names a class or function for Hydra to call"),
+        ("# @package hydra.callbacks\nx: {_target_: pathlib.Path.touch}\n", "found.yaml: names a class"),
     ],
 )
 def test_a_preset_that_hydra_would_choke_on_or_run(text, said, tmp_path, call):
@@ -127,4 +128,25 @@ def test_a_preset_that_hydra_would_choke_on_or_run(text, said, tmp_path, call):
     (tmp_path / "mine" / "reader" / "found.yaml").write_text(text)
     ended = call("ingest", "--config-dir", "mine", "reader=found", "source=.", "out=made")
     assert ended.code == 2 and said in ended.err and len(ended.err.splitlines()) == 1, ended
+    assert not Path(MADE).exists()
+
+
+@pytest.mark.parametrize(
+    ("given", "text", "package"),
+    [
+        ("[hook]", HOOK, "reader"),
+        ("[/reader/hook]", HOOK, "reader"),
+        ("[{/imu: hook}]", HOOK, "imu"),
+        ("[{override /hydra/callbacks: [none, hook]}]", "x: {_target_: pathlib.Path.touch}\n", "hydra/callbacks"),
+        ("[{/imu@_global_.hydra.callbacks: hook}]", "x: {_target_: pathlib.Path.touch}\n", "imu"),
+        ("[/imu/hook@_global_.hydra.callbacks]", "x: {_target_: pathlib.Path.touch}\n", "imu"),
+    ],
+)
+def test_what_a_preset_takes_into_its_defaults_runs_nothing(given, text, package, tmp_path, call):
+    for folder in ("reader", package):
+        (tmp_path / "mine" / folder).mkdir(parents=True, exist_ok=True)
+    (tmp_path / "mine" / "reader" / "found.yaml").write_text(f"defaults: {given}\n_target_: x.Reader\n")
+    (tmp_path / "mine" / package / "hook.yaml").write_text(text)
+    ended = call("ingest", "--config-dir", "mine", "reader=found", "source=.", "out=made")
+    assert ended.code == 2 and "hook.yaml: names a class or function for Hydra to call" in ended.err, ended
     assert not Path(MADE).exists()
