@@ -17,7 +17,6 @@ from pathlib import Path
 
 import torch
 from pipelines.studies import kf_gins, parity
-from pipelines.studies.compiled_step import times_in_c
 from pipelines.studies.figures.bench_figures import Bench, Timing, machine
 from rich.console import Console
 
@@ -37,7 +36,7 @@ from dlkf.navigation.attitude import rotation_from_vector
 from dlkf.navigation.imu_errors import ImuSpec
 from dlkf.navigation.strapdown import strapdown
 from dlkf.onboard.check import time_epochs
-from dlkf.onboard.compiled_filter import compile_filter
+from dlkf.onboard.compiled_filter import CompiledFilter, compile_filter
 from dlkf.onboard.library import find_compiler
 from dlkf.running.batched import run_filter
 from dlkf.running.start import align_drives
@@ -123,6 +122,19 @@ def epochs(bench: Bench, dataset: Path, imu: ImuSpec, models: list[str]) -> None
         in_c = compile_filter(resolve_model(name, imu), RATE_HZ, 1.0)
         for kind, seconds in {**time_epochs(in_c, drive), "C": times_in_c(in_c, batch)}.items():
             bench.add(Timing("an epoch", f"{name} in {kind}", seconds))
+
+
+def times_in_c(compiled: CompiledFilter, batch: Batch) -> list[float]:
+    """Seconds of the epochs' calls alone, memory and samples at hand."""
+    memory, _ = compiled.begin(batch)
+    numbers, seconds = memory.numbers, []
+    fix = torch.zeros(1, 19, dtype=torch.float64)
+    for k in range(20, batch.size[1]):
+        imu = batch.imu[:, k].contiguous()
+        began = time.perf_counter()
+        numbers, _ = compiled.library.turn(numbers, imu, fix)
+        seconds.append(time.perf_counter() - began)
+    return seconds
 
 
 def peers(bench: Bench, folder: Path, minutes: float, checkout: Path | None) -> None:
