@@ -89,6 +89,9 @@ def test_tables_hold_the_summarise_scores(scores):
     assert "ins : mbkf15 = 0.70 [0.60, 0.80] by geometric mean: better" in describe_verdict(
         replace(r, comparisons=enough), "ins"
     )
+    for ratio in (1.0, float("nan")):  # alike, or both broke
+        alike = replace(r, comparisons=[replace(c, ratio=ratio) for c in r.comparisons])
+        assert " by geometric mean: neither is better, but too few" in describe_verdict(alike, "ins")
     assert describe_verdict(r, "none such") is None
     few = r.versus("ins", "outages", "end", "horizontal")
     assert format_interval(replace(few, groups=8, ratio=0.7, ratio_low=0.6, ratio_high=0.8)) == "0.70 [0.60–0.80]"
