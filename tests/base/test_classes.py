@@ -106,29 +106,16 @@ def test_a_reader_that_came_with_a_dataset_runs_nothing(tmp_path, call):
     assert not made.exists()
 
 
-BOMB = "a0: &a0 [x,x,x,x,x,x,x,x,x,x]\n"
-BOMB += "".join(f"a{k + 1}: &a{k + 1} [{', '.join([f'*a{k}'] * 10)}]\n" for k in range(9))
 HOOK = "# @package _global_\nhydra: {callbacks: {x: {_target_: pathlib.Path.touch, self: made-by-a-stranger}}}\n"
 
 
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        ("a: [1", "found.yaml is not readable YAML"),
-        ("_target_: !!python/object/apply:os.system [touch x]", "found.yaml is not readable YAML"),
-        ("[" * 5000, "nested too deeply"),
-        ("&a [*a]", "aliases"),
-        (BOMB, "aliases"),
-        (HOOK, "found.yaml: names a class or function for Hydra to call"),
-        ("# @package hydra.callbacks\nx: {_target_: pathlib.Path.touch}\n", "found.yaml: names a class"),
-    ],
-)
-def test_a_preset_that_hydra_would_choke_on_or_run(text, said, tmp_path, call):
+@pytest.mark.parametrize("text", [HOOK, "# @package hydra.callbacks\nx: {_target_: pathlib.Path.touch}\n"])
+def test_a_preset_names_nothing_for_hydra_to_call(text, tmp_path, call):
     (tmp_path / "mine" / "reader").mkdir(parents=True)
     (tmp_path / "mine" / "reader" / "found.yaml").write_text(text)
     ended = call("ingest", "--config-dir", "mine", "reader=found", "source=.", "out=made")
-    assert ended.code == 2 and said in ended.err and len(ended.err.splitlines()) == 1, ended
-    assert not Path(MADE).exists()
+    assert ended.code == 2 and "found.yaml: names a class or function for Hydra to call" in ended.err, ended
+    assert len(ended.err.splitlines()) == 1 and not Path(MADE).exists()
 
 
 @pytest.mark.parametrize(
