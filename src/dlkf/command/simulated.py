@@ -61,7 +61,7 @@ class FixNoise:
 
 @dataclass(frozen=True, kw_only=True)
 class ConsistencySettings(FilterSettings, Ranged, where="consistency"):
-    """``dlkf consistency``; ``vehicle`` and ``chassis`` may hold ranges, the drives' own are those of ``matched``."""
+    """``dlkf consistency``; ``vehicle`` and ``chassis`` may hold ranges; :class:`MatchedDrives` has the limits."""
 
     chassis: Mapping[str, Any]
     vehicle: Mapping[str, Any]

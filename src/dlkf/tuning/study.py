@@ -218,6 +218,7 @@ def write_tuning(
 def _write(
     out: str | Path, table: ResultTable, presets: Mapping[str, Any], more: Mapping[str, str] = MappingProxyType({})
 ) -> list[str]:
+    """Presets under the table's title, table.md and ``more`` files, all or none; their names."""
     head = f"# {table.title}\n"
     files = {f"{key}.yaml": head + yaml.safe_dump(values, sort_keys=False) for key, values in presets.items()}
     files |= {"table.md": as_markdown(table), **more}
