@@ -117,7 +117,7 @@ def join_scores(parts: Sequence[Scores]) -> Scores:
         values = [getattr(x, name) for x in things]
         return np.concatenate(values if name in OF_SEGMENTS else [_pad(x, T) for x in values])
 
-    def join(things: Sequence[Any]) -> dict[str, Array]:
+    def join(things: Sequence[Any]) -> dict[str, Any]:
         return {name: rows(things, name) for name, x in vars(things[0]).items() if isinstance(x, np.ndarray)}
 
     filters = {name: FilterRun(**join([s.filters[name] for s in parts])) for name in parts[0].filters}
