@@ -22,6 +22,7 @@ import torch
 
 from dlkf.data.alignment import ALIGN
 from dlkf.data.drive import Batch
+from dlkf.data.limits import horizontal_distance
 from dlkf.data.store import load_dataset
 from dlkf.filters.integration import Estimator
 from dlkf.filters.model_based import Mbkf
@@ -83,8 +84,7 @@ def _geodetic(batch: Batch, p_n: torch.Tensor) -> np.ndarray:
 def final_error(batch: Batch, at: np.ndarray) -> float:
     """Horizontal distance [m] of a place from the truth at the end."""
     truth = _geodetic(batch, batch.truth.p_n[:, -1])[0]
-    north, east = 6.37e6 * (at[0] - truth[0]), 6.37e6 * np.cos(truth[0]) * (at[1] - truth[1])
-    return float(np.hypot(north, east))
+    return float(horizontal_distance(*np.degrees((*truth[:2], *at[:2]))))
 
 
 def processor_time(estimator: Estimator, batch: Batch) -> float:
