@@ -111,7 +111,7 @@ def tune_filter(
     A factor goes up its values, or down them, until two in a row are worse; nothing is tried twice. From an hour of
     segments on trials run compiled (:mod:`dlkf.onboard`), which is the same to rounding; where they cannot, a line
     has the reason. ``prior`` is given to a filter with ``_prior``. Returns the best factors, their
-    :func:`evaluate_objective`, and the trials, of which there are at most as many as ``progress`` is told.
+    :func:`evaluate_objective`, and the trials; ``progress`` gets how many they are and can be at most.
     """
     best = start or Tuning()
 
