@@ -47,14 +47,8 @@ def main() -> int:
         "length_s=120", "stride_s=120", f"out={OUT}/simulated", *COMMON)  # fmt: skip
     simulated, real = results(OUT / "simulated"), None
     if options.kitti:
-        run(
-            "simulate",
-            f"source={options.kitti}",
-            "imu=consumer",
-            "receiver=white",
-            f"out={OUT}/kitti",
-            "overwrite=true",
-        )
+        words = ("imu=consumer", "receiver=white", f"out={OUT}/kitti", "overwrite=true")
+        run("simulate", f"source={options.kitti}", *words)
         run("evaluate", "model=[ins,mbkf15,mbkf21_car,plus]", f"dataset={OUT}/kitti", "mode=drives",
             "outage.duration_s=30", "outage.first_s=20", f"out={OUT}/real", *COMMON)  # fmt: skip
         real = results(OUT / "real")

@@ -13,10 +13,9 @@ go to ``dlkf.train``.
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 
-from trainings import Study, run
+from trainings import Study, arguments, run
 
 HOME = Path("outputs/paper/figures")
 SEMI_REAL = Path("data/semi_real_one")
@@ -29,16 +28,15 @@ SHORT = (
 
 def main() -> None:
     """Both trainings of every seed under one parent run."""
-    arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    arguments.add_argument("--seeds", default="0", help="both trainings for each")
-    arguments.add_argument("--real", help="dataset of real drives, whose motion is used")
-    options, overrides = arguments.parse_known_args()
+    parser = arguments(__doc__, "0", "both trainings for each")
+    parser.add_argument("--real", help="dataset of real drives, whose motion is used")
+    options, overrides = parser.parse_known_args()
     if options.real and not SEMI_REAL.exists():
         unit = ("dataset=semi_real", f"source={options.real}", "dataset.imu_errors=one")
         run("simulate", *unit, f"out={SEMI_REAL}")
     study = Study(HOME)
     with study.parent("figures", "paper 5.3, figures 11 to 14"):
-        for seed in options.seeds.split(","):
+        for seed in options.seeds:
             study.train(f"minute/{seed}", "+experiment=minute", f"seed={seed}", *overrides)
             if options.real:
                 given = ("+experiment=outage", "name=semi_real", f"seed={seed}", *SHORT, *overrides)

@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 from dlkf.base.files import write_into
 from dlkf.evaluation.results import Results
-from dlkf.evaluation.table import format_interval, format_number
+from dlkf.evaluation.table import ResultTable, all_tables, format_interval, format_number
 from dlkf.report.page import Page, embed_png
 
 FIGURES = Path(__file__).parents[1] / "docs" / "figures" / "paper"
@@ -199,10 +199,10 @@ def section(page: Page, home: Path, part: Part) -> list[Claim]:
         "A classical filter has one row where it is the same for every seed. [ ]: 95 % interval over the recordings."
     )
     key, first = next(iter(runs.items()))
-    for title, columns, body, note in tables_of(first / "table.md"):
-        if any(words in title for words in part.tables):
-            page.heading(f"{title} ({key})", note)
-            page.table(columns, body)
+    for table in tables_of(first):
+        if any(words in table.title for words in part.tables):
+            page.heading(f"{table.title} ({key})", table.note)
+            page.table(table.columns, table.rows)
     for name, caption in part.pictures.items():
         if (first / "figures" / f"{name}.png").is_file():
             page.picture(f"{caption} ({key})", embed_png((first / "figures" / f"{name}.png").read_bytes()))
@@ -255,16 +255,11 @@ def verdict(met: list[bool]) -> str:
     return "yes" if all(met) else "no" if not any(met) else f"in part: {sum(met)} of {len(met)}"
 
 
-def tables_of(file: Path) -> list[tuple[str, list[str], list[list[str]], str]]:
-    """(title, columns, rows, note) of the tables that a training's report has beside its page."""
-    found = []
-    for block in file.read_text().split("\n**") if file.is_file() else []:
-        title, _, rest = block.lstrip("*").partition("**")
-        lines = [line for line in rest.splitlines() if line.strip()]
-        grid = [split(line) for line in lines if line.startswith("|")]
-        if len(grid) > 2:
-            found.append((title, grid[0], grid[2:], " ".join(line for line in lines if not line.startswith("|"))))
-    return found
+def tables_of(report: Path) -> list[ResultTable]:
+    """All tables of a training's report."""
+    content = json.loads((report / "metrics.json").read_text())
+    more = [ResultTable(**table) for table in content["tables"]]
+    return all_tables(content["dataset"], [Results.of(x) for x in content["results"]]) + more
 
 
 def gains(page: Page, folder: Path) -> list[Claim]:

@@ -97,12 +97,10 @@ def statistics(error: np.ndarray, way: np.ndarray) -> str:
     return f"{mean:.2f}, {np.median(error):.2f}, {np.sqrt((error**2).mean()):.2f}, {100 * share:.2f}"
 
 
-def ratio(aided: np.ndarray, plain: np.ndarray, groups: Sequence[str]) -> str:
-    """Of the geometric means, with its interval where there are recordings enough."""
-    result = compare(aided, plain, statistic="geomean", groups=groups)
-    if not np.isfinite(result.ratio_low):
-        return f"{result.ratio:.2f}"
-    return f"{result.ratio:.2f} [{result.ratio_low:.2f}, {result.ratio_high:.2f}]"
+def ratio(ours: np.ndarray, theirs: np.ndarray, groups: Sequence[str], statistic: str = "geomean") -> str:
+    """Of a statistic of errors, with its interval where there are recordings enough."""
+    c = compare(ours, theirs, statistic=statistic, groups=groups)
+    return f"{c.ratio:.2f}" if np.isnan(c.ratio_low) else f"{c.ratio:.2f} [{c.ratio_low:.2f}, {c.ratio_high:.2f}]"
 
 
 def print_errors(

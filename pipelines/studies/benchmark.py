@@ -2,8 +2,8 @@
 
 Windowed strapdown against a loop over samples, filters in torch and compiled for one drive and for 64, an epoch by
 itself, tuning, training epochs of the learned filters, and how cost goes with hours, drives, length, rate, batch and
-threads. Beside them python-ins on the same drive; on request the strapdown of PyPose (``--pypose``, where it is
-installed) and KF-GINS (``--kf-gins FOLDER``, a checkout). Prints a table with bars, writes ``outputs/bench.json``
+threads. Beside them python-ins on the same drive; on request
+KF-GINS (``--kf-gins FOLDER``, a checkout). Prints a table with bars, writes ``outputs/bench.json``
 (median, least, 99th percentile of the repeats of every figure, the machine, the commit), draws ``outputs/bench.png``.
 """
 
@@ -17,7 +17,6 @@ from pathlib import Path
 
 import torch
 from pipelines.studies import kf_gins, parity
-from pipelines.studies.compiled_step import times_in_c
 from pipelines.studies.figures.bench_figures import Bench, Timing, machine
 from rich.console import Console
 
@@ -37,7 +36,7 @@ from dlkf.navigation.attitude import rotation_from_vector
 from dlkf.navigation.imu_errors import ImuSpec
 from dlkf.navigation.strapdown import strapdown
 from dlkf.onboard.check import time_epochs
-from dlkf.onboard.compiled_filter import compile_filter
+from dlkf.onboard.compiled_filter import CompiledFilter, compile_filter
 from dlkf.onboard.library import find_compiler
 from dlkf.running.batched import run_filter
 from dlkf.running.start import align_drives
@@ -82,23 +81,6 @@ def windows(batch: Batch) -> torch.Tensor:
     return state.p_n.detach()
 
 
-def pypose_chunks(batch: Batch) -> torch.Tensor:
-    """PyPose's integrator over the same samples, a second at a time, on a flat Earth that does not turn."""
-    import pypose  # type: ignore[import-not-found]  # on request
-
-    p, v, C = batch.start
-    error = torch.zeros(len(p), 6, dtype=p.dtype, requires_grad=True)
-    dt = torch.full((*batch.imu[:, 0, :, :1].shape,), batch.dt, dtype=p.dtype)
-    integrator = pypose.module.IMUPreintegrator(prop_cov=False, reset=True, gravity=-9.80665).to(p.dtype)
-    state = {"pos": p[:, None], "rot": pypose.mat2SO3(C, check=False)[:, None], "vel": v[:, None]}
-    for t in range(batch.size[1]):
-        imu = batch.imu[:, t] - error.unsqueeze(1)
-        out = integrator(dt=dt, gyro=imu[..., 3:], acc=imu[..., :3], init_state=state)
-        state = {name: out[name][:, -1:] for name in ("pos", "rot", "vel")}
-    (state["pos"].sum() + state["vel"].sum()).backward()
-    return state["pos"].detach()[:, 0]
-
-
 def filters(bench: Bench, dataset: Path, imu: ImuSpec, length_s: float, models: list[str]) -> None:
     """Filters over drives at the files' own rate, one and 64 at once, in torch and compiled, interleaved."""
     drives = load_dataset(dataset, rate_hz=RATE_HZ, dtype=torch.float64)
@@ -123,6 +105,19 @@ def epochs(bench: Bench, dataset: Path, imu: ImuSpec, models: list[str]) -> None
         in_c = compile_filter(resolve_model(name, imu), RATE_HZ, 1.0)
         for kind, seconds in {**time_epochs(in_c, drive), "C": times_in_c(in_c, batch)}.items():
             bench.add(Timing("an epoch", f"{name} in {kind}", seconds))
+
+
+def times_in_c(compiled: CompiledFilter, batch: Batch) -> list[float]:
+    """Seconds of the epochs' calls alone, memory and samples at hand."""
+    memory, _ = compiled.begin(batch)
+    numbers, seconds = memory.numbers, []
+    fix = torch.zeros(1, 19, dtype=torch.float64)
+    for k in range(20, batch.size[1]):
+        imu = batch.imu[:, k].contiguous()
+        began = time.perf_counter()
+        numbers, _ = compiled.library.turn(numbers, imu, fix)
+        seconds.append(time.perf_counter() - began)
+    return seconds
 
 
 def peers(bench: Bench, folder: Path, minutes: float, checkout: Path | None) -> None:
@@ -224,7 +219,7 @@ def scaling(bench: Bench, dataset: Path, imu: ImuSpec, length_s: float) -> None:
             bench.time("over batch", work, lambda: training_epoch(data, "dlkf_literal", 1), 3, at=size)
 
 
-def mechanisation(bench: Bench, folder: str, length_s: float, pypose: bool) -> float:
+def mechanisation(bench: Bench, folder: str, length_s: float) -> float:
     """Windows against the loop over samples, forward and backward; returns how far apart they end [m]."""
     drives = load_dataset(folder, dtype=torch.float64)
     segments = cut_segments(drives, length_s)[:50]
@@ -236,8 +231,6 @@ def mechanisation(bench: Bench, folder: str, length_s: float, pypose: bool) -> f
     bench.time("strapdown", f"sample loop, {what}, float64", lambda: sample_loop(batch), 1)
     bench.time("strapdown", f"windows, {what}, float64", lambda: windows(batch))
     bench.time("strapdown", f"windows, {what}, float32", lambda: windows(single))
-    if pypose:
-        bench.time("strapdown", f"PyPose, 1 s chunks, {what}, float64", lambda: pypose_chunks(batch), 3)
     return float((windows(batch) - sample_loop(batch)).norm(dim=-1).max())
 
 
@@ -251,7 +244,6 @@ def main() -> None:
     arguments.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS))
     arguments.add_argument("--models", nargs="+", default=list(COMPILED))
     arguments.add_argument("--processor", action="store_true", help="time of the processor: for a machine that is busy")
-    arguments.add_argument("--pypose", action="store_true", help="its strapdown too; pip install --no-deps pypose")
     arguments.add_argument("--kf-gins", type=Path, help="a checkout of KF-GINS, whose engine is compiled and run too")
     arguments.add_argument("--out", type=Path, default=Path("outputs"))
     options = arguments.parse_args()
@@ -264,7 +256,7 @@ def main() -> None:
         data, other = Path(folder) / "drives", Path(folder) / "parity"
         simulate(recipe, data)
         if "strapdown" in options.parts:
-            apart = mechanisation(bench, str(data), length_s := min(60.0, options.length_s), options.pypose)
+            apart = mechanisation(bench, str(data), length_s := min(60.0, options.length_s))
             console.print(f"loop and windows end {apart:.1e} m apart after {length_s:g} s: the loop is first order")
         works = {
             "filters": lambda: filters(bench, data, recipe.imu, options.length_s, options.models),

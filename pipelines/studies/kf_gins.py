@@ -12,16 +12,17 @@ from __future__ import annotations
 import argparse
 import subprocess
 import tempfile
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import torch
-from pipelines.studies.compiled_step import processor_time
 
 from dlkf.data.alignment import ALIGN
 from dlkf.data.drive import Batch
+from dlkf.data.limits import horizontal_distance
 from dlkf.data.store import load_dataset
 from dlkf.filters.integration import Estimator
 from dlkf.filters.model_based import Mbkf
@@ -83,8 +84,14 @@ def _geodetic(batch: Batch, p_n: torch.Tensor) -> np.ndarray:
 def final_error(batch: Batch, at: np.ndarray) -> float:
     """Horizontal distance [m] of a place from the truth at the end."""
     truth = _geodetic(batch, batch.truth.p_n[:, -1])[0]
-    north, east = 6.37e6 * (at[0] - truth[0]), 6.37e6 * np.cos(truth[0]) * (at[1] - truth[1])
-    return float(np.hypot(north, east))
+    return float(horizontal_distance(*np.degrees((*truth[:2], *at[:2]))))
+
+
+def processor_time(estimator: Estimator, batch: Batch) -> float:
+    """Of one run [s]."""
+    began = time.process_time()
+    run_filter(batch, estimator)
+    return time.process_time() - began
 
 
 @contextmanager

@@ -26,6 +26,7 @@ from dlkf.data.store import load_dataset
 from dlkf.data.tables import read_drives
 from dlkf.filters.smoother import Filter
 from dlkf.filters.tuning import Tuning
+from dlkf.report.plots import find_runs
 from dlkf.running.batched import run_filter
 from dlkf.tracking.models import resolve_model
 
@@ -83,17 +84,10 @@ def segment_errors(
     return SegmentErrors(*(np.concatenate(x) for x in zip(*found)))
 
 
-def longest_run(known: np.ndarray) -> tuple[int, int]:
-    """First and last place of the longest run of True."""
-    edge = np.flatnonzero(np.diff(np.concatenate(([0], known.astype(np.int8), [0]))))
-    first, stop = edge[::2], edge[1::2]
-    longest = int((stop - first).argmax())
-    return int(first[longest]), int(stop[longest]) - 1
-
-
 def dead_reckoning(drives: Sequence[Drive]) -> Batch:
     """Each drive's longest time with a known attitude, from the truth, without a fix."""
-    runs = [longest_run((d.ref_valid & d.ref_C_eb.isfinite().flatten(1).all(-1)).numpy()) for d in drives]
+    known = [(d.ref_valid & d.ref_C_eb.isfinite().flatten(1).all(-1)).numpy() for d in drives]
+    runs = [max(find_runs(x), key=lambda run: run[1] - run[0]) for x in known]
     parts = [Segment(k, first, last - first) for k, (first, last) in enumerate(runs)]
     batch = make_batch(drives, parts, start=StartLaw(0, 0, 0, 0))
     nothing = torch.zeros_like(batch.available)

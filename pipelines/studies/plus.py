@@ -33,6 +33,7 @@ import pandas as pd
 import torch
 import yaml
 from pipelines.studies.ablations.plus_parts import parts
+from pipelines.studies.aids import ratio
 from pipelines.studies.simulated_laws import COMMON, INJECTED, PYTHON_INS, SILENT, SIMULATED, simulate_sets
 from pipelines.studies.tuning.descent import tune_by_gradient
 
@@ -46,7 +47,6 @@ from dlkf.data.masks import withhold_fixes
 from dlkf.data.segments import StartLaw, cut_segments, make_batch, whole_drives
 from dlkf.data.stack import DriveStack
 from dlkf.data.store import dataset_digest, load_dataset
-from dlkf.evaluation.bootstrap import compare
 from dlkf.evaluation.metrics import mean_error
 from dlkf.filters.build import build_causal, build_filter
 from dlkf.filters.integration import Estimator
@@ -217,10 +217,7 @@ def markdown(rows: Sequence[Row]) -> list[str]:
         cells = [row.name, str(row.before_s), str(row.length_s), f"{len(row.groups)} ({len(set(row.groups))})"]
         errors = {n: f"{mean_error(e, 'rms'):.1f} / {mean_error(e, 'log'):.2f}" for n, e in row.errors.items()}
         cells.append(errors["plus"])
-        for statistic in ("rms", "geomean"):
-            c = compare(row.errors["plus"], row.errors[best], statistic=statistic, groups=row.groups)
-            band = "" if np.isnan(c.ratio_low) else f" [{c.ratio_low:.2f}, {c.ratio_high:.2f}]"
-            cells.append(f"{c.ratio:.2f}{band}")
+        cells += [ratio(row.errors["plus"], row.errors[best], row.groups, s) for s in ("rms", "geomean")]
         cells.append(f"{row.nees['plus']:.1f}")
         cells += [f"**{errors[name]}**" if name == best else errors[name] for name in (*baselines, *after)]
         lines.append(f"| {' | '.join(cells)} |")
@@ -248,11 +245,8 @@ def pooled(rows: Sequence[Row]) -> list[str]:
             lines.append(f"| {kind} | {' | '.join(cells)} |")
             both = np.concatenate([r.errors["plus"] for r in chosen])
             groups = [f"{recorded(r.name)} {g}" for r in chosen for g in r.groups]
-            ratios = []
-            for name in names:
-                other = np.concatenate([r.errors[name] for r in chosen])
-                c = compare(both, other, statistic="geomean", groups=groups)
-                ratios.append(f"{c.ratio:.2f} [{c.ratio_low:.2f}, {c.ratio_high:.2f}]" if name != "plus" else "")
+            others = {name: np.concatenate([r.errors[name] for r in chosen]) for name in names if name != "plus"}
+            ratios = [ratio(both, others[name], groups) if name in others else "" for name in names]
             lines.append(f"| `plus` : it | {' | '.join(ratios)} |")
     return lines
 

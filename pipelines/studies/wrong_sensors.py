@@ -32,6 +32,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from pipelines.studies.ablations.plus_parts import parts
+from pipelines.studies.aids import ratio
 from pipelines.studies.plus import REAL, SOURCES, Row, load, real_cases, recorded, score, simulated_cases
 from pipelines.studies.simulated_laws import INJECTED, simulate_sets
 from torch import Tensor
@@ -45,7 +46,6 @@ from dlkf.data.schema import ACCEL, GYRO
 from dlkf.data.segments import whole_drives
 from dlkf.data.store import drive_from_tables, drive_rows
 from dlkf.data.validate import CheckedTables, read_drive
-from dlkf.evaluation.bootstrap import compare
 from dlkf.evaluation.metrics import mean_error
 from dlkf.filters.build import build_causal
 from dlkf.filters.integration import Estimator
@@ -264,9 +264,7 @@ def table(rows: Mapping[tuple[str, str], list[Row]]) -> list[str]:
         )
         best = min(gated, key=lambda errors: mean_error(errors, "log"))
         groups = [f"{recorded(r.name)} {g}" for r in some for g in r.groups]
-        for other in (best, without):
-            c = compare(ours, other, statistic="geomean", groups=groups)
-            cells.append(f"{c.ratio:.2f} [{c.ratio_low:.2f}, {c.ratio_high:.2f}]")
+        cells += [ratio(ours, other, groups) for other in (best, without)]
         lines.append(f"| {where} | {kind} | {len(some)} | {' | '.join(cells)} |")
     return lines
 

@@ -45,7 +45,7 @@ def main(settings: ConsistencySettings) -> None:
             batch, outage = withhold_fixes(batch, mask), mask[0].numpy()
         with show_progress(f"Running {name}") as progress:
             estimator = resolve_model(model, spec, tuning=settings.tuning)
-            assert has_covariance(estimator)  # as ``states_of`` has seen
+            assert has_covariance(estimator)  # as ``find_states`` has seen
             results[name] = measure_consistency(estimator, batch, matrices, progress)
     title = f"{matched.drives} simulated drives of {matched.minutes:g} min, IMU {preset.name}, errors as modelled"
     table = consistency_table(results, settings.settle_s, title)

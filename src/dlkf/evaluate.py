@@ -50,9 +50,9 @@ class EvaluationRun(NamedTuple):
     protocol: Mapping[str, Any]
     digest: str
     baseline: str
-    sensors: ResultTable | None = None
-    notes: Sequence[str] = ()
-    advice: str = ""
+    sensors: ResultTable | None
+    notes: Sequence[str]
+    advice: str
 
 
 def evaluate_dataset(settings: EvaluateSettings, console: Console, typed: Sequence[str] = ()) -> EvaluationRun:

@@ -25,8 +25,16 @@ from dlkf.filters.tuning import FittedOn
 from dlkf.onboard.compiled_filter import compile_or_keep
 from dlkf.running.likelihood import Evidence, find_noise
 from dlkf.tracking.runs import start_run, tracking_uri
-from dlkf.tuning.found import noise_table, write_noise
-from dlkf.tuning.study import LIKELIHOOD, check_settings, search, train_test_drives, tuning_table, write_tuning
+from dlkf.tuning.study import (
+    LIKELIHOOD,
+    check_settings,
+    noise_table,
+    search,
+    train_test_drives,
+    tuning_table,
+    write_noise,
+    write_tuning,
+)
 
 
 @command("tune", TuneSettings)

@@ -17,6 +17,9 @@ PAGE = "/#/experiments{of}?workflowType=machine_learning"
 
 def main() -> None:
     """Start the server, print the links, stay until Ctrl-C."""
+    if {"--help", "-h"} & set(sys.argv[1:]):
+        print(f"{__doc__}\nKeys: port=5000, host=127.0.0.1, uri=<MLflow store; of this folder by default>.")
+        return
     split = (argument.partition("=") for argument in sys.argv[1:])
     given = {key: value for key, _, value in split}
     try:

@@ -37,6 +37,12 @@ def test_a_command_prints_it_and_does_nothing_else(call):
     assert done.code == 0 and "model=…" in done.out and "aligned, coarse" in done.out and not done.err
 
 
+def test_ui_says_its_keys(call):
+    """It is no program of Hydra's, whose pages the others have."""
+    done = call("ui", "--help")
+    assert done.code == 0 and "port=5000" in done.out and not done.err
+
+
 def test_a_command_says_the_version_of_this_package(call):
     done = call("evaluate", "--version")
     assert done.code == 0 and done.out == f"dlkf {dlkf.__version__}\n"

@@ -81,19 +81,3 @@ def test_navigate_writes_solutions_without_a_reference(call, tmp_path):
     assert "Left out as impossible: 1 fix of car-01." in (tmp_path / "solved" / "report.html").read_text()
     assert pq.read_schema(tmp_path / "solved" / "drive=car-01" / "solution.parquet").equals(GEO_SCHEMA)
     assert sorted(p.name for p in (tmp_path / "solved").iterdir()) == ["drive=car-01", "log.txt", "report.html"]
-
-
-@pytest.mark.parametrize(
-    ("command", "arguments", "said"),
-    [
-        ("navigate", ["model=mbkf99"], "unknown model 'mbkf99'"),
-        ("navigate", ["model=mbkf15", "imu=none_such"], "none_such"),
-        ("evaluate", ["model=mbkf15", "tuning.gyro_noise=-1.0"], "tuning: gyro_noise is -1.0"),
-        ("evaluate", ["model=mbkf99", "imu=consumer"], "unknown model 'mbkf99'"),  # nothing is said of its noise
-    ],
-)
-def test_a_mistake_is_one_line_and_leaves_nothing(town, call, tmp_path, command, arguments, said):
-    done = call(command, *arguments, f"dataset={town}", "out=made", "rate_hz=20")
-    assert done.code == 2
-    assert len(done.err.strip().splitlines()) == 1 and said in done.err and not done.out
-    assert not (tmp_path / "made").exists()

@@ -12,7 +12,7 @@ from plotly.subplots import make_subplots
 from dlkf.report.drawing import Figure, library, panels, template
 from dlkf.report.navigation import navigation_page
 from dlkf.report.page import Page
-from dlkf.report.plots import MOST, extremes
+from dlkf.report.plots import MOST, extremes, find_runs
 from tests.evaluation.drawn import figures_of
 from tests.running.test_offline import driven
 
@@ -93,6 +93,11 @@ def test_a_page_of_drives_holds_figures_that_plotly_knows():
     assert list(figures) == ["map", *(f"{what}-{k}" for k in range(2) for what in ("motion", "innovations", "imu"))]
     assert len(figures["motion-0"].data) == 4 and len(figures["imu-1"].data) == 12
     assert library() in page and f"const TEMPLATE = {template()};" in page and "{{" not in page.replace(library(), "")
+
+
+def test_runs_of_true():
+    assert find_runs(np.array([True, False, True, True, False])) == [(0, 0), (2, 3)]
+    assert find_runs(np.ones(4, bool)) == [(0, 3)] and find_runs(np.zeros(3, bool)) == []
 
 
 def test_thinning_keeps_every_peak_and_every_gap():

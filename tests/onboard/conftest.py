@@ -10,6 +10,8 @@ from dlkf.data.store import drive_from_tables, drive_rows
 from dlkf.data.validate import read_drive
 from dlkf.filters.aids.attach import with_aids
 from dlkf.filters.build import build_filter
+from dlkf.filters.integration import Estimator
+from dlkf.filters.learned import LearnedConfig, LearnedFilter
 from dlkf.navigation.imu_errors import ImuSpec, SensorErrors
 from dlkf.onboard.c_source import write_source
 from dlkf.onboard.functions import Grid, count_output_numbers, make_layout
@@ -18,6 +20,7 @@ from dlkf.onboard.recording import export_mode
 from dlkf.simulation.dataset import DatasetConfig, simulate_dataset
 from dlkf.simulation.gnss.white import GnssConfig
 from dlkf.simulation.sensors import BaroConfig, HeadingConfig, SensorsConfig, WheelConfig
+from dlkf.tracking.models import resolve_model
 
 IMU = ImuSpec(
     "mems", SensorErrors(2.5e-3, 0.02, 1e-3, 3600.0, 3e-3, 3e-3), SensorErrors(9e-5, 1e-3, 1e-4, 3600.0, 3e-3, 3e-3)
@@ -33,6 +36,14 @@ SENSORS = SensorsConfig(
     HeadingConfig(rate_hz=1.0),
     BaroConfig(rate_hz=1.0),
 )
+
+
+def model_of(name: str) -> Estimator:
+    """A filter by name; ``dlkf`` of the paper's sizes with fresh weights, whose values do not change its speed."""
+    if name != "dlkf":
+        return resolve_model(name, IMU)
+    settings = {"outage_mode": "run", "frame": "heading", "imu_error": "affine", "imu_error_bound": 4.0}
+    return LearnedFilter(LearnedConfig.from_mapping({**settings, "network": {"dropout": 0.0}})).eval()
 
 
 @pytest.fixture(scope="session")

@@ -18,7 +18,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from pipelines.studies.compiled_step import IMU, model_of
 
 from dlkf.data.store import drive_rows
 from dlkf.data.validate import CheckedTables, read_drive
@@ -30,7 +29,7 @@ from dlkf.onboard.library import CORE, FILTER, build
 from dlkf.running.streaming import StreamingFilter
 from dlkf.simulation.dataset import DatasetConfig, simulate_dataset
 from dlkf.simulation.gnss.white import GnssConfig
-from tests.onboard.conftest import ARM
+from tests.onboard.conftest import ARM, IMU, model_of
 from tests.onboard.programs import compile_program, run, stack_of_calls
 from tests.onboard.streams import METRES, SOLUTION, calls, through_core
 

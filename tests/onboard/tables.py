@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from pipelines.studies.compiled_step import model_of
 
 from dlkf.data.aid_tables import STANDARD
 from dlkf.data.store import drive_rows
@@ -28,7 +27,7 @@ from dlkf.running.streaming import StreamingFilter
 from dlkf.simulation.dataset import DatasetConfig, simulate_dataset
 from dlkf.simulation.gnss.white import GnssConfig
 from tests.cars import REAL
-from tests.onboard.conftest import ARM, GRID, IMU, KIND, SENSORS
+from tests.onboard.conftest import ARM, GRID, IMU, KIND, SENSORS, model_of
 from tests.onboard.faults import FAULTS
 from tests.onboard.streams import METRES, SOLUTION, Answers, Calls, calls, through_core, through_python
 

@@ -33,7 +33,14 @@ def test_what_was_run_and_what_was_not(tmp_path, monkeypatch, capsys):
     results = summarise_scores(score(filters, [batch], outages=[mask], kinds="simulated"))
     report = tmp_path / "run" / "report"
     report.mkdir(parents=True)
-    (report / "metrics.json").write_text(as_json({"results": [results.as_dict()]}))
+    later = {
+        "title": "town: heading when GNSS goes",
+        "note": "",
+        "columns": ["Filter", "22 s"],
+        "rows": [["dlkf", "3"]],
+    }
+    content = {"dataset": "town", "results": [results.as_dict()], "tables": [later]}
+    (report / "metrics.json").write_text(as_json(content))
     (tmp_path / "paper" / "outage").mkdir(parents=True)
     done = {"parent": "abc", "dlkf/0": str(tmp_path / "run")}
     (tmp_path / "paper" / "outage" / "trainings.json").write_text(json.dumps(done))
@@ -44,6 +51,7 @@ def test_what_was_run_and_what_was_not(tmp_path, monkeypatch, capsys):
     (line,) = [line for line in said.splitlines() if "Outages of 30 to 50 s" in line]
     assert line.split(" | ")[1:3] == ["0.44 / 0.57 / 0.74", " / ".join(format_number(r, digits=2) for r in ratios)]
     assert line.endswith({0: "no", 3: "yes"}.get(met, f"in part: {met} of 3"))
+    assert "town: heading when GNSS goes (dlkf/0)" in page
     assert "1.43 m" in page and "Not run yet: python pipelines/paper_kalman_gain.py" in page
     assert "python pipelines/paper_imu_error.py | not run" in said
     assert all(f"Figure {n} (drawn anew" in page for n in (1, 2, 3, 5)) and page.count("data:image/png") == 4
@@ -58,7 +66,8 @@ def test_seeds_share_the_rows_of_classical_filters(tmp_path, monkeypatch, capsys
         results = summarise_scores(score(filters, [batch], outages=[mask], kinds="simulated"))
         report = tmp_path / str(seed) / "report"
         report.mkdir(parents=True)
-        (report / "metrics.json").write_text(as_json({"results": [results.as_dict()]}))
+        content = {"dataset": "town", "results": [results.as_dict()], "tables": []}
+        (report / "metrics.json").write_text(as_json(content))
         done[f"minute/{seed}"] = str(report.parent)
     (tmp_path / "figures").mkdir()
     (tmp_path / "figures" / "trainings.json").write_text(json.dumps(done))

@@ -3,7 +3,7 @@
 import math
 
 import numpy as np
-from pipelines.studies.kitti_odometry import LENGTHS_M, left_out_best, longest_run, segment_errors
+from pipelines.studies.kitti_odometry import LENGTHS_M, left_out_best, segment_errors
 
 
 def turned(yaw: np.ndarray) -> np.ndarray:
@@ -44,11 +44,6 @@ def test_errors_are_relative_to_the_first_pose():
     R = turned(np.array([1.1]))[0]
     e = segment_errors(true_p @ R.T + 50, R @ true_C, true_p, true_C)
     assert len(e.translation) > 1000 and e.translation.max() < 1e-9 and e.rotation.max() < 1e-6
-
-
-def test_the_longest_run():
-    assert longest_run(np.array([True, False, True, True, False])) == (2, 3)
-    assert longest_run(np.ones(4, bool)) == (0, 3)
 
 
 def test_constants_come_from_the_other_sequences():

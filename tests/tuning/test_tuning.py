@@ -79,9 +79,8 @@ def test_one_lost_segment_decides_rms_but_not_the_median(cars):
 
 def test_a_search_mends_noise_that_is_told_too_small(cars):
     small = replace(IMU, accel=replace(IMU.accel, noise_density=1e-5), gyro=replace(IMU.gyro, noise_density=1e-6))
-    trials = []
     factors = {"accel_noise": (1.0, 100.0), "gyro_noise": (1.0, 100.0)}
-    best, score = tune_filter(small, [hidden(cars)], factors=factors, rounds=1, progress=trials.append)
+    best, score, trials = tune_filter(small, [hidden(cars)], factors=factors, rounds=1)
     assert (best.accel_noise, best.gyro_noise) != (1.0, 1.0)
     assert score == min(t.score for t in trials) < evaluate_objective(build_filter("mbkf15", small), [hidden(cars)])
 
@@ -94,10 +93,7 @@ def test_a_search_in_c_finds_what_one_in_torch_finds(cars, monkeypatch):
     found = []
     for least in (10**9, 1):  # torch, C
         monkeypatch.setattr("dlkf.tuning.search.IN_C", least)
-        trials = []
-        best, score = tune_filter(
-            IMU, [hidden(cars)], name="mbkf15_nhc", factors=factors, rounds=1, progress=trials.append
-        )
+        best, score, trials = tune_filter(IMU, [hidden(cars)], name="mbkf15_nhc", factors=factors, rounds=1)
         found.append((best, score, [t.score for t in trials]))
     (best, score, scores), (best_c, score_c, scores_c) = found
     assert best == best_c and len(set(scores)) == len(scores)

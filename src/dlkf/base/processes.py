@@ -16,7 +16,7 @@ def process_label(number: int | None = None) -> str:
         state, *rest = Path(f"/proc/{number}/stat").read_text().rpartition(")")[2].split()
         start = "gone" if state == "Z" else rest[18]  # in ticks since the machine was started
     except OSError:
-        start = "unknown" if not Path("/proc/self/stat").exists() and _is_there(number) else "gone"
+        start = "gone"
     return f"{MACHINE}-{number}-{start}"
 
 
@@ -24,11 +24,3 @@ def is_gone(label: str) -> bool:
     """Whether a label is of a process of this machine that has ended; of another machine's nothing is known."""
     machine, _, rest = label.rpartition("-")[0].rpartition("-")
     return machine == MACHINE and rest.isdigit() and process_label(int(rest)) != label
-
-
-def _is_there(number: int) -> bool:
-    try:
-        os.kill(number, 0)
-    except OSError as error:
-        return isinstance(error, PermissionError)
-    return True

@@ -19,6 +19,8 @@ from dlkf.base.files import is_url
 from dlkf.base.settings import is_number
 
 SWITCHED_OFF = ("outage", "injected_bias", "smoother", "export")  # where none means null
+OF_HYDRA = re.compile(r"(^|[/.])hydra([/.]|$)")  # groups and packages of its own settings
+HYDRA_HEADER = re.compile(r"^#\s*@package\s+(_global_\.)?hydra\b", re.MULTILINE)
 WITH_VALUE = ("--config-dir", "-cd", "--config-path", "-cp", "--config-name", "-cn", "--package", "-p", "--cfg", "-c")
 
 
@@ -46,20 +48,43 @@ def move_options_first(arguments: Sequence[str]) -> list[str]:
 def check_presets(arguments: Sequence[str]) -> None:
     """InputError for a preset of a ``--config-dir`` folder that Hydra could not read, or that names what Hydra calls.
 
-    Such a folder may have come with a dataset.
+    Such a folder may have come with a dataset. With a preset count those that its list of defaults takes.
     """
-    folders, words = get_args_parser().parse_known_args(list(arguments))[0].config_dir, []
-    for word in arguments if folders else ():
-        key, equals, value = word.lstrip("+").partition("=")
+    folder = get_args_parser().parse_known_args(list(arguments))[0].config_dir
+    for word in arguments if folder else ():
+        choice, equals, value = word.lstrip("+").partition("=")
         if equals and not word.startswith("-"):
-            names = value.strip("[]'\"").split(",")
-            words += [(key.partition("@")[0], name.strip("'\" ")) for name in names]
-    for group, name in words:
-        file = Path(folders) / group / f"{name}.yaml"
-        if group and name and file.is_file():
-            values = read_yaml(file)
-            if isinstance(values, Mapping) and _names_calls(values.get("hydra")):
-                raise InputError(f"{file}: names a class or function for Hydra to call; presets of your own must not")
+            for name in value.strip("[]'\"").split(","):
+                _check_preset(Path(folder), choice, name.strip("'\" "), set())
+
+
+def _check_preset(folder: Path, choice: str, name: str, seen: set[Path]) -> None:
+    """The preset ``name`` of a choice, ``group`` or ``group@package``, if the folder has it."""
+    group, _, package = choice.partition("@")
+    file = folder / group / f"{name}.yaml"
+    if not group or not name or file in seen or not file.is_file():
+        return
+    seen.add(file)
+    values = read_yaml(file)
+    if not isinstance(values, Mapping):
+        return
+    of_hydra = OF_HYDRA.search(package or group) or HYDRA_HEADER.search(file.read_text(encoding="utf-8"))
+    if _names_calls(values if of_hydra else values.get("hydra")):
+        raise InputError(f"{file}: names a class or function for Hydra to call; presets of your own must not")
+    listed = values.get("defaults")
+    for entry in listed if isinstance(listed, list) else ():
+        for key, chosen in entry.items() if isinstance(entry, Mapping) else [_split_default(str(entry))]:
+            path = re.sub(r"^(override |optional )*", "", str(key))
+            inner = path.removeprefix("/") if path.startswith("/") else f"{group}/{path}"
+            for one in chosen if isinstance(chosen, list) else [chosen]:
+                _check_preset(folder, inner, str(one), seen)
+
+
+def _split_default(entry: str) -> tuple[str, str]:
+    """``folder/name@package`` of a list of defaults as ``folder@package`` and ``name``."""
+    path, at, package = entry.partition("@")
+    folder, slash, name = path.rpartition("/")
+    return f"{folder or slash}{at}{package}", name
 
 
 def check_choices(arguments: Sequence[str]) -> None:

@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from dlkf.command.settings import (
-    DriveSelection,
-    FilterSettings,
-    StoreSettings,
-    check_above_zero,
-    check_file_name,
-    check_not_below_zero,
-)
+from dlkf.base.settings import Ranged, bounded_field
+from dlkf.command.settings import DriveSelection, FilterSettings, StoreSettings, check_file_name
 from dlkf.data.alignment import ALIGN, AlignConfig
 from dlkf.data.masks import BiasLaw
 from dlkf.data.segments import StartLaw
@@ -39,7 +34,7 @@ class ScoringSettingsBase:
 
 
 @dataclass(frozen=True, kw_only=True)
-class EvaluateSettings(FilterSettings, DriveSelection, ScoringSettingsBase):
+class EvaluateSettings(FilterSettings, DriveSelection, ScoringSettingsBase, Ranged, where="evaluate"):
     """``dlkf evaluate``."""
 
     name: str
@@ -48,24 +43,21 @@ class EvaluateSettings(FilterSettings, DriveSelection, ScoringSettingsBase):
     reference: str
     parallel: int | str | None
     unseen: bool
-    settle_s: float
+    settle_s: float = bounded_field(10.0, 0, math.inf)
     baseline: str | None
     figures: bool
     tracking: StoreSettings
 
-    def __post_init__(self) -> None:
-        check_not_below_zero(self, "settle_s")
-
 
 @dataclass(frozen=True, kw_only=True)
-class TuneSettings(FilterSettings, DriveSelection, ScoringSettingsBase):
+class TuneSettings(FilterSettings, DriveSelection, ScoringSettingsBase, Ranged, where="tune"):
     """``dlkf tune``."""
 
     name: str
     objective: str
-    minutes: float
-    rounds: int
-    segments: int | None
+    minutes: float = bounded_field(20.0, 0.01, math.inf)
+    rounds: int = bounded_field(2, 1, 1000)
+    segments: int | None = bounded_field(150, 1, math.inf)
     split: Split
     fractions: Sequence[float]
     split_seed: int
@@ -74,5 +66,5 @@ class TuneSettings(FilterSettings, DriveSelection, ScoringSettingsBase):
     tracking: StoreSettings
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         check_file_name(self.name)
-        check_above_zero(self, "minutes", "rounds", "segments")

@@ -174,21 +174,6 @@ class RegisterSettings:
     tracking: StoreSettings
 
 
-def check_above_zero(settings: Any, *names: str) -> None:
-    """InputError for one of these settings that is 0 or less."""
-    for name in names:
-        value = getattr(settings, name)
-        if value is not None and value <= 0:
-            raise InputError(f"{name} is {value!r}, must be above 0")
-
-
-def check_not_below_zero(settings: Any, *names: str) -> None:
-    """InputError for one of these settings that is less than 0."""
-    for name in names:
-        if (value := getattr(settings, name)) < 0:
-            raise InputError(f"{name} is {value!r}, must be 0 or more")
-
-
 def check_file_name(name: str) -> None:
     """InputError for what should not name a preset's file."""
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]*", name):

@@ -3,6 +3,7 @@ of the consistency check. Apart, as the other commands load no simulation."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,9 +15,9 @@ from rich.console import Console
 from dlkf.base.config import config_dir
 from dlkf.base.errors import InputError
 from dlkf.base.ranges import has_ranges, range_middle
-from dlkf.base.settings import settings_from
+from dlkf.base.settings import Ranged, bounded_field, settings_from
 from dlkf.command.composing import compose_command, to_plain
-from dlkf.command.settings import FilterSettings, check_above_zero, check_not_below_zero
+from dlkf.command.settings import FilterSettings
 from dlkf.data.segments import StartLaw
 from dlkf.diagnosis.matched_drives import MatchedDrives
 from dlkf.evaluation.outages import OutagePlan
@@ -59,8 +60,8 @@ class FixNoise:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ConsistencySettings(FilterSettings):
-    """``dlkf consistency``; ``vehicle`` and ``chassis`` may hold ranges."""
+class ConsistencySettings(FilterSettings, Ranged, where="consistency"):
+    """``dlkf consistency``; ``vehicle`` and ``chassis`` may hold ranges; :class:`MatchedDrives` has the limits."""
 
     chassis: Mapping[str, Any]
     vehicle: Mapping[str, Any]
@@ -70,12 +71,8 @@ class ConsistencySettings(FilterSettings):
     minutes: float
     rate_hz: int
     gnss: FixNoise
-    settle_s: float
+    settle_s: float = bounded_field(10.0, 0, math.inf)
     seed: int
-
-    def __post_init__(self) -> None:
-        check_above_zero(self, "drives", "minutes", "rate_hz")
-        check_not_below_zero(self, "settle_s")
 
     @property
     def matched(self) -> MatchedDrives:

@@ -16,14 +16,14 @@ The bias instability is B = min σ / √(2 ln 2/π), read at the curve's lowest 
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import yaml
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.optimize import nnls
@@ -35,7 +35,7 @@ from dlkf.base.provenance import describe_provenance
 from dlkf.data.schema import stack_columns
 from dlkf.evaluation.figures import plain_axes, png
 from dlkf.evaluation.table import ResultTable, as_json, as_markdown, format_number
-from dlkf.navigation.imu_errors import DEG, MILLIGAL, ImuSpec, SensorErrors
+from dlkf.navigation.imu_errors import DEG, MILLIGAL, ImuSpec
 from dlkf.report.page import Page, embed_png
 
 Array = NDArray[np.floating]
@@ -45,12 +45,12 @@ PER_DECADE = 15  # cluster times
 WHITE_S = 100.0  # a log must be so long for the white noise
 RISE = 1.5  # the curve must end so far above its white part for the bias instability to be resolved
 RESOLVED = 20.0  # correlation times that a log must hold for one to be used
-FIRST = ("noise_density", "turn_on_bias", "instability", "correlation_time", "scale_factor", "misalignment")
 STILL_RATE, STILL_FORCE = math.radians(1.0), 0.3  # rad/s, m/s²: a second's mean away from the log's median
 AXES = tuple(f"{sensor}_{axis}" for sensor in ("accel", "gyro") for axis in "xyz")
 TRIADS = ("accel", "gyro")
 NAMES = {"accel": "Accelerometers", "gyro": "Gyroscopes"}
 UNITS = {"accel": "m/s²", "gyro": "rad/s"}
+UNITS_LINE = "# accelerometers in m/s², gyroscopes in rad/s; noise_density per √Hz, correlation_time in s\n"
 
 
 @dataclass(frozen=True)
@@ -166,21 +166,7 @@ def noise_preset(name: str, triads: Sequence[AllanFit], base: ImuSpec, source: s
 
 def preset_yaml(spec: ImuSpec) -> str:
     """The text of ``imu/<name>.yaml``: what ``imu=`` takes with ``--config-dir``."""
-    lines = [f"name: {spec.name}", f"source: {json.dumps(spec.source, ensure_ascii=False)}"]
-    for key, unit, sensor in (("accel", "m/s²", spec.accel), ("gyro", "rad/s", spec.gyro)):
-        units = {"noise_density": f"{unit}/√Hz", "turn_on_bias": unit, "instability": unit, "correlation_time": "s"}
-        lines.append(f"{key}:")
-        for field in fields(SensorErrors):
-            value = getattr(sensor, field.name)
-            if field.name in FIRST or value != field.default:
-                note = f" # {units[field.name]}" if field.name in units else ""
-                lines.append(f"  {field.name}: {_number(value)}{note}")
-    return "\n".join(lines) + "\n"
-
-
-def _number(x: float) -> str:
-    text = f"{x:.6g}"
-    return text.replace("e", ".0e") if "e" in text and "." not in text else text  # YAML 1.1 takes 1e-3 for a word
+    return UNITS_LINE + yaml.safe_dump(spec.as_preset(), sort_keys=False, allow_unicode=True)
 
 
 def _shapes(tau: Array, T: float) -> Array:

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr, stdtrit
 
-from dlkf.evaluation.metrics import LEAST_LOG, Array
+from dlkf.evaluation.metrics import LEAST_LOG, Array, rms_over_segments
 
 STATISTICS = ("rms", "mean", "median", "geomean")
 MIN_GROUPS = 8  # with fewer recordings, or independent segments, than this there is no interval
@@ -146,10 +146,8 @@ def rms_band(
     NaN where a column has no value. The bounds are NaN too where one is not finite, or where fewer than
     :data:`MIN_GROUPS` recordings (rows where no ``groups`` are given) have one.
     """
-    valid = ~np.isnan(x)
-    n = valid.sum(0)
+    valid, rms = ~np.isnan(x), rms_over_segments(x)
     square = np.where(valid, x, 0.0) ** 2
-    rms = np.where(n > 0, np.sqrt(square.sum(0) / np.maximum(n, 1)), np.nan)
     low, high = np.full((2, len(rms)), np.nan)
     drawn = np.arange(len(x)) if groups is None else _number(np.asarray(groups, dtype=str))
     counted = np.array([len(np.unique(drawn[valid[:, k]])) for k in range(len(rms))])  # groups with a value

@@ -197,8 +197,6 @@ def spread_evenly(items: Sequence[Item], limit: int | None) -> list[Item]:
     n = len(items)
     if limit is None or limit >= n:
         return list(items)
-    if limit < 1:
-        raise InputError(f"segments={limit} must be at least 1, or null for all")
     return [items[(2 * k + 1) * n // (2 * limit)] for k in range(limit)]
 
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -112,26 +113,16 @@ def join_scores(parts: Sequence[Scores]) -> Scores:
         return parts[0]
     T = max(s.outage.shape[1] for s in parts)
 
-    def rows(things: Sequence[object], name: str) -> Array:
+    def rows(things: Sequence[Any], name: str) -> Array:
         values = [getattr(x, name) for x in things]
         return np.concatenate(values if name in OF_SEGMENTS else [_pad(x, T) for x in values])
 
-    def join_filter(name: str) -> FilterRun:
-        runs = [s.filters[name] for s in parts]
-        return FilterRun(*(rows(runs, f.name) for f in fields(FilterRun)))
+    def join(things: Sequence[Any]) -> dict[str, Any]:
+        return {name: rows(things, name) for name, x in vars(things[0]).items() if isinstance(x, np.ndarray)}
 
-    return Scores(
-        epoch_s=parts[0].epoch_s,
-        segments=[segment for s in parts for segment in s.segments],
-        outage=rows(parts, "outage").astype(np.bool_, copy=False),
-        fix=rows(parts, "fix").astype(np.bool_, copy=False),
-        truth_p_n=rows(parts, "truth_p_n"),
-        truth_v_n=rows(parts, "truth_v_n"),
-        true_imu_error=rows(parts, "true_imu_error"),
-        origin_e=rows(parts, "origin_e"),
-        injected_bias=rows(parts, "injected_bias"),
-        filters={name: join_filter(name) for name in parts[0].filters},
-    )
+    filters = {name: FilterRun(**join([s.filters[name] for s in parts])) for name in parts[0].filters}
+    segments = [segment for s in parts for segment in s.segments]
+    return Scores(epoch_s=parts[0].epoch_s, segments=segments, filters=filters, **join(parts))
 
 
 def _pad(x: Array, T: int) -> Array:

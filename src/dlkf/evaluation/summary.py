@@ -8,14 +8,14 @@ from collections.abc import Iterable, Sequence
 from dlkf.evaluation.bootstrap import MIN_GROUPS
 from dlkf.evaluation.results import Results
 from dlkf.evaluation.scores import Scores
-from dlkf.evaluation.table import DEGREES, format_number, format_ratios
+from dlkf.evaluation.table import DEGREES, format_length, format_number, format_ratios
 from dlkf.filters.build import is_filter
 from dlkf.filters.tuning import Tuning
 from dlkf.running.innovations import OF_NETWORK, REMEDY, fit_sigma
 
 FEW = 20  # outages or segments; fewer have no 95 %: their largest error stands instead
 THROUGHOUT_S = 5.0  # the longest time without a fix that is no gap
-END = ("outages", "end", "horizontal")
+END, SETTLED = ("outages", "end", "horizontal"), ("segments", "settled", "horizontal")
 METRICS = {
     "outage_end_horizontal_m": (*END, "rms"),
     "outage_end_horizontal_median_m": (*END, "median"),
@@ -53,7 +53,7 @@ def headline(result: Results) -> str:
     horizontal error over the settled part of the segments, with the longest time without a fix unless it is short.
     """
     span = result.count["outage_s"]
-    where = ("outages", "end", "horizontal") if span else ("segments", "settled", "horizontal")
+    where = END if span else SETTLED
     unit = "outage" if span else "segment"
     count = int(result.count.get(f"{unit}s") or 0)
     statistics = ("median", "p95") if count >= FEW else ("median", "max") if count > 1 else ("median",)
@@ -65,7 +65,7 @@ def headline(result: Results) -> str:
     gap = result.count.get("longest_without_fix_s", math.inf)
     own = "With GNSS throughout" if gap <= THROUGHOUT_S else "With all fixes of the drives"
     own += f", at most {gap:.3g} s without one" if THROUGHOUT_S < gap < math.inf else ""
-    lead = f"{_length(*span)} without GNSS" if span else own
+    lead = f"{format_length(*span)} without GNSS" if span else own
     text = f"{lead}, {count} {unit}{'s' if count > 1 else ''}: {best} ends " if span else f"{lead}: {best} is "
     drift = result.value(best, "outages", "end", "drift", "median") if span else math.nan
     share = f" ({format_number(100 * drift, digits=2)} % of the distance driven)" if math.isfinite(drift) else ""
@@ -92,7 +92,7 @@ def describe_verdict(result: Results, name: str) -> str | None:
     if baseline is not None and comparison is not None:
         ratio, low, high = format_ratios(comparison.ratio, comparison.ratio_low, comparison.ratio_high)
         if comparison.groups < MIN_GROUPS:
-            direction = "worse" if comparison.ratio > 1 else "better"
+            direction = "worse" if comparison.ratio > 1 else "better" if comparison.ratio < 1 else "neither is better"
             verdict = f"{ratio} by geometric mean: {direction}, but too few recordings for an interval"
         else:
             less, more = comparison.ratio_high < 1, comparison.ratio_low > 1
@@ -128,10 +128,6 @@ def sigma_warnings(scores: Scores) -> list[str]:
             lines.append(fit.short_warning(name) if remedy in remedies else fit.warning(name, remedy))
             remedies.add(remedy)
     return lines
-
-
-def _length(low: float, high: float) -> str:
-    return f"{low:g} s" if low == high else f"{low:g} to {high:g} s"
 
 
 def _spread(texts: Sequence[str], count: int, unit: str, share: str) -> str:

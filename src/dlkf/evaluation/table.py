@@ -55,6 +55,11 @@ def format_number(x: float, scale: float = 1.0, digits: int = 3) -> str:
     return f"{x:.{min(decimals, 6)}f}" if abs(x) < 1e5 else f"{x:.2e}"
 
 
+def format_length(low: float, high: float) -> str:
+    """Of outages [s], the shortest and the longest."""
+    return f"{low:g} s" if low == high else f"{low:g} to {high:g} s"
+
+
 def format_ratios(*ratios: float) -> list[str]:
     """Ratios in two decimals, in three or four where one that is not 1 would read 1.00: each stands on its side of 1.
 
@@ -110,9 +115,8 @@ def result_tables(dataset: str, result: Results) -> list[ResultTable]:
 
 def outage_table(what: str, result: Results) -> ResultTable:
     """Errors at the end of the outages and at round times into them."""
-    n, low, high = result.count, *result.count["outage_s"]
-    length = f"{low:g} s" if low == high else f"{low:g} to {high:g} s"
-    at = [s for s in result.seconds_into_outage() if float(s) < high][-2:]
+    n, length = result.count, format_length(*result.count["outage_s"])
+    at = [s for s in result.seconds_into_outage() if float(s) < n["outage_s"][1]][-2:]
     driven = int(max(result.value(name, "outages", "end", "drift", "n") for name in result.filters))
     of_some = f" over the {_count(driven, 'outage')} of more than {LEAST_M:g} m" if driven < n["outages"] else ""
     table = ResultTable(

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from dlkf.base.errors import InputError
@@ -83,6 +83,13 @@ class ImuSpec:
     accel: SensorErrors
     gyro: SensorErrors
     source: str = ""
+
+    def as_preset(self) -> dict[str, Any]:
+        """The plain values that :func:`imu_spec` makes it of; optional errors that it does not have are left out."""
+        usual = asdict(SensorErrors())
+        sensors = {key: asdict(getattr(self, key)) for key in ("accel", "gyro")}
+        kept = {s: {k: x for k, x in v.items() if k in NEEDED or x != usual[k]} for s, v in sensors.items()}
+        return {"name": self.name, "source": self.source, **kept}
 
 
 AUTO = "auto"  # the preset of imu=auto

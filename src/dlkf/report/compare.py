@@ -14,7 +14,7 @@ from dlkf.base.colours import filter_colour
 from dlkf.base.errors import InputError
 from dlkf.base.files import write_into
 from dlkf.evaluation.results import Results
-from dlkf.evaluation.summary import headline
+from dlkf.evaluation.summary import END, SETTLED, headline
 from dlkf.evaluation.table import format_number
 from dlkf.report.drawing import Figure
 from dlkf.report.evaluation import mark_best
@@ -121,7 +121,7 @@ def end_table(reports: Sequence[StoredReport]) -> tuple[list[str], list[list[str
     for report in reports:
         for result in report.results:
             out = result.count["outages"]
-            where = ("outages", "end", "horizontal") if out else ("segments", "settled", "horizontal")
+            where = END if out else SETTLED
             for name in result.filters:
                 errors = [format_number(result.value(name, *where, s)) for s in ("rms", "median", "p95")]
                 drift = format_number(result.value(name, "outages", "end", "drift", "median"), 100)

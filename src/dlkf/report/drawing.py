@@ -19,6 +19,8 @@ from typing import Any
 
 import numpy as np
 
+from dlkf.base.config import merge_settings
+
 Trace = dict[str, Any]
 TEMPLATE = "plotly_white"
 MOST_DECADES = 5  # of a logarithmic axis with every power of ten
@@ -42,15 +44,15 @@ class Figure:
 
     def update_layout(self, **more: Any) -> None:
         """Set properties of the layout, those of nested ones each by itself."""
-        _merge(self.layout, more)
+        self.layout = merge_settings(self.layout, more)
 
     def update_xaxis(self, row: int = 1, **more: Any) -> None:
         """Set properties of a panel's time axis."""
-        _merge(self.layout.setdefault(f"xaxis{_number(row)}", {}), more)
+        self.update_layout(**{f"xaxis{_number(row)}": more})
 
     def update_yaxis(self, row: int = 1, **more: Any) -> None:
         """Set properties of a panel's value axis."""
-        _merge(self.layout.setdefault(f"yaxis{_number(row)}", {}), more)
+        self.update_layout(**{f"yaxis{_number(row)}": more})
 
     def set_log_scale(self, row: int = 1) -> None:
         """A logarithmic value axis of the traces that the panel has, its numbers written out (10000, not 10k): powers
@@ -133,14 +135,6 @@ def _log_ticks(low: float, high: float) -> list[float]:
     step = next(s for s in (1, 2, 5, 10) if s * 10.0**power >= least)
     count = [math.floor(low / step / 10.0**power) - 1, math.ceil(high / step / 10.0**power) + 2]
     return [float(f"{k * step}e{power}") for k in range(max(count[0], 1), count[1])]
-
-
-def _merge(into: dict[str, Any], more: dict[str, Any]) -> None:
-    for key, value in more.items():
-        if isinstance(value, dict) and isinstance(into.get(key), dict):
-            _merge(into[key], value)
-        else:
-            into[key] = value
 
 
 def _plain(value: Any) -> Any:

@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 
 from dlkf.base.colours import SHADE, TRUTH, filter_colour
-from dlkf.base.files import resolve_place, write_into
+from dlkf.base.files import write_into
 from dlkf.evaluation.metrics import Mask, magnitudes, outage_at, outage_end, rms_over_segments
 from dlkf.evaluation.outages import UNUSED
 from dlkf.evaluation.results import Results
@@ -58,8 +58,8 @@ def write_report(
     trained: str | None = None,
     warnings: Sequence[str] = (),
     losses: Mapping[str, Sequence[float]] = MappingProxyType({}),
-) -> list[Path]:
-    """Write the whole report into ``out``, all files or none; returns their paths.
+) -> None:
+    """Write the whole report into ``out``, all files or none.
 
     ``results`` has one entry per kind of data (of scores.of_kind); ``protocol`` is how the
     scores were made, in plain values; ``more`` tables follow those of the results; ``figures``: figures for print as
@@ -91,7 +91,6 @@ def write_report(
             (folder / "figures").mkdir()
         for name, data in files.items():
             (folder / name).write_bytes(data)
-    return [resolve_place(out) / name for name in files]
 
 
 def print_figures(

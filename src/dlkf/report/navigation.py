@@ -14,7 +14,7 @@ from dlkf.filters.aids.estimates import format_estimate, label_estimate
 from dlkf.report.drawing import Figure
 from dlkf.report.maps import add_track, chart, dots, join_tracks
 from dlkf.report.page import Page
-from dlkf.report.plots import Array, band, every, line, shade, spans, stack_panels
+from dlkf.report.plots import Array, band, every, find_runs, line, shade, spans, stack_panels
 from dlkf.running.innovations import SETTLE, Innovation
 from dlkf.running.offline import Navigated, UsableFixes
 
@@ -179,9 +179,7 @@ def route_map(courses: Sequence[TrackOnMap]) -> Figure:
 
 def _insert_breaks(place: Array, most: int) -> Array:
     """Runs of known positions, thinned each, with a NaN after each."""
-    known = np.isfinite(place[:, 0])
-    edge = np.flatnonzero(np.diff(np.concatenate(([0], known.astype(np.int8), [0]))))
-    return join_tracks([place[max(a - 1, 0) : b] for a, b in zip(edge[::2], edge[1::2])], most)
+    return join_tracks([place[max(a - 1, 0) : b + 1] for a, b in find_runs(np.isfinite(place[:, 0]))], most)
 
 
 def make_rows(courses: Sequence[TrackOnMap]) -> tuple[list[str], list[list[str]], list[str]]:

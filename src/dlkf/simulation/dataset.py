@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import json
-import math
 import os
-import re
 import sys
 from collections.abc import Mapping
 from contextlib import closing
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -24,81 +22,16 @@ from dlkf.base.errors import InputError
 from dlkf.base.files import absolute_place, is_url, resolve_place
 from dlkf.base.parallel import check_engine, parallel_map
 from dlkf.base.ranges import draw_ranges, has_ranges, range_middle
-from dlkf.base.settings import Ranged, bounded_field, settings_from
+from dlkf.base.settings import settings_from
 from dlkf.data.schema import drive_file, new_dataset, write_drive, write_drives_table, write_parquet
 from dlkf.navigation.imu_errors import ImuSpec, imu_spec
-from dlkf.simulation.drive import Rates, Seeds, SimulatedTables, simulate_drive
+from dlkf.simulation.drive import DatasetConfig, Seeds, SimulatedTables, simulate_drive
 from dlkf.simulation.gnss.almanac import read_almanac
-from dlkf.simulation.gnss.receiver import Receiver, receiver_spec
-from dlkf.simulation.gnss.surroundings import Surroundings
-from dlkf.simulation.gnss.white import GnssConfig
+from dlkf.simulation.gnss.receiver import receiver_spec
 from dlkf.simulation.imu import ImuUnit, draw_unit
-from dlkf.simulation.motion.chassis import ChassisConfig
-from dlkf.simulation.motion.routes import VehicleConfig
 from dlkf.simulation.sensors import SensorsConfig
 
-LONGEST_DRIVE = 240.0  # minutes; a drive is held in memory as a whole
-MOST_EPOCHS = 100_000  # of a drive with satellites, 2 GB
 OF_ALL_DRIVES = ("name", "hours", "drive_minutes", "imu_errors", "unit_seed")
-
-
-@dataclass(frozen=True)
-class DatasetConfig(Ranged, where="dataset"):
-    """What to simulate. ``imu_errors``: ``one`` unit for all drives, a new one ``per_drive``, a ``fleet``, or ``wide``.
-
-    With ``one``, turn-on bias, scale factors and misalignment are drawn once, from ``unit_seed``: the same
-    IMU on other roads is another seed with the same ``unit_seed``. White noise and the in-run bias belong to
-    each drive either way. With ``fleet``, each drive has a new unit of a type drawn from ``fleet``; with ``wide``, of
-    a type of its own, drawn from the ranges of the IMU preset.
-    An IMU sample is the mean over its interval, taken of ``imu_parts`` parts; 0 gives the constant rate and force that
-    act like the interval, which loading corrects for coning a second time (some mm in a minute with little vibration).
-    Fixes come from the satellites in view of a ``receiver``, or have white noise without one; ``raw`` keeps its
-    observations as well.
-    """
-
-    name: str
-    hours: float = bounded_field(5.0, 0.005, 1e5)
-    drive_minutes: float = bounded_field(10.0, 0.25, LONGEST_DRIVE)
-    imu_rate_hz: int = bounded_field(100, 10, 2000)
-    reference_rate_hz: int = bounded_field(10, 1, 2000)
-    imu_parts: int = bounded_field(0, 0, 16)
-    imu_errors: Literal["one", "per_drive", "fleet", "wide"] = "one"
-    unit_seed: int = bounded_field(0, 0, 2**63)
-    fleet: Mapping[str, ImuSpec] = field(default_factory=dict)
-    vehicle: VehicleConfig = field(default_factory=VehicleConfig)
-    chassis: ChassisConfig = field(default_factory=ChassisConfig)
-    surroundings: Surroundings = field(default_factory=Surroundings)
-    gnss: GnssConfig = field(default_factory=GnssConfig)
-    receiver: Receiver | None = None
-    raw: bool = False
-    sensors: SensorsConfig | None = None
-
-    def __post_init__(self) -> None:
-        if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", self.name):
-            raise InputError(f"dataset: name {self.name!r} must be letters, digits, _ . - ")
-        super().__post_init__()
-        rates = {"gnss.rate_hz": self.gnss.rate_hz, "reference_rate_hz": self.reference_rate_hz}
-        for name, rate in rates.items():
-            samples = self.imu_rate_hz / rate if rate > 0 else 0.0
-            if samples < 1 or abs(samples - round(samples)) > 1e-9:
-                raise InputError(f"dataset: imu_rate_hz {self.imu_rate_hz} is not a multiple of {name} {rate}")
-        if self.imu_errors == "fleet" and not self.fleet:
-            raise InputError("dataset: imu_errors is fleet, but fleet names no IMU presets (see simulated/fleet.yaml)")
-        if not isinstance(self.raw, bool) or (self.raw and self.receiver is None):
-            raise InputError(f"raw={self.raw}: there are raw observations with a satellite receiver=<preset> only")
-        epochs = self.gnss.rate_hz * self.drive_minutes * 60
-        if self.receiver is not None and epochs > MOST_EPOCHS:
-            raise InputError(
-                f"dataset: gnss.rate_hz {self.gnss.rate_hz} over drive_minutes {self.drive_minutes:g} are {epochs:.0f} "
-                f"epochs of satellites, more than {MOST_EPOCHS}; make the drives shorter or the rate lower"
-            )
-
-    @property
-    def durations(self) -> list[int]:
-        """Whole seconds of every drive: the hours shared out evenly over drives of at most drive_minutes."""
-        total = round(self.hours * 3600)
-        drives = math.ceil(total / (self.drive_minutes * 60) - 1e-9)
-        return [total // drives + (k < total % drives) for k in range(drives)]
 
 
 def dataset_config(config: Mapping[str, Any]) -> DatasetConfig:
@@ -256,12 +189,8 @@ def make_drive(made_by: Recipe, index: int, seconds: int) -> tuple[SimulatedTabl
         made_by.seed, spawn_key=(1, index)
     ).spawn(8)
     config, spec, kind, unit = draw_presets(made_by, unit_seed, type_seed, ranges_seed)
-    rates = Rates(int(config.imu_rate_hz), config.gnss.rate_hz, int(config.reference_rate_hz), int(config.imu_parts))
-    tables = simulate_drive(
-        Seeds(motion, imu, gnss, surroundings, chassis), seconds, rates,
-        config.vehicle, config.chassis, config.surroundings, kind, unit, config.gnss, config.receiver,
-        config.sensors, np.random.SeedSequence(made_by.seed, spawn_key=(2, index)),
-    )  # fmt: skip
+    sensors = np.random.SeedSequence(made_by.seed, spawn_key=(2, index))
+    tables = simulate_drive(Seeds(motion, imu, gnss, surroundings, chassis, sensors), seconds, config, kind, unit)
     name = f"{config.name}-{made_by.seed}-{index:05d}"
     row = {
         "drive": name,
@@ -271,8 +200,8 @@ def make_drive(made_by: Recipe, index: int, seconds: int) -> tuple[SimulatedTabl
         "imu": kind.name,
         "gnss": gnss_text(config),
         "reference": "exact",
-        "imu_rate_hz": float(rates.imu_hz),
-        "gnss_rate_hz": float(rates.gnss_hz),
+        "imu_rate_hz": float(config.imu_rate_hz),
+        "gnss_rate_hz": float(config.gnss.rate_hz),
         "duration_s": float(seconds),
         **{f"lever_arm_{axis}_m": float(x) for axis, x in zip("xyz", config.gnss.lever_arm_b)},
         **tables.facts,

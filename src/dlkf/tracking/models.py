@@ -49,7 +49,7 @@ def resolve_model(
         return build_plus(imu)
     if folder := shipped_folder(spec):
         return load_filter(folder)
-    if is_tracked(spec):
+    if RUN_ID.fullmatch(spec) or spec.startswith(("models:/", "runs:/")):
         from dlkf.tracking.registry import download_model  # MLflow takes seconds to import
 
         folder = download_model(spec, tracking_uri)
@@ -114,11 +114,6 @@ def own_filter(spec: str, imu: ImuSpec) -> Estimator:
     """
     kind = find_class(spec, "model", ("begin", "step"))
     return kind(imu=imu) if "imu" in signature(kind).parameters else kind()
-
-
-def is_tracked(spec: str) -> bool:
-    """Whether a model is to be had from MLflow: a run id, ``runs:/…`` or ``models:/…``."""
-    return bool(RUN_ID.fullmatch(spec)) or spec.startswith(("models:/", "runs:/"))
 
 
 def resolve_models(

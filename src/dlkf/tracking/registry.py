@@ -228,10 +228,12 @@ def _find_registered(client: MlflowClient, spec: str, uri: str) -> str:
     if match is None:
         raise InputError(f"model={spec} is malformed; write models:/<name>@<alias>, models:/<name>/<version>")
     name, alias, number = match["name"], match["alias"], match["version"]
+    if "'" in name:
+        raise InputError(f"model=models:/{name}: a name with a quote cannot be looked up")
     try:
         if name.startswith("m-") and not alias and not number:
             return client.get_logged_model(name).artifact_location
-        versions = sorted(int(v.version) for v in client.search_model_versions(f"name='{_check_quote(name)}'"))
+        versions = sorted(int(v.version) for v in client.search_model_versions(f"name='{name}'"))
         aliases = client.get_registered_model(name).aliases
     except MlflowException as error:
         if error.error_code != "RESOURCE_DOES_NOT_EXIST":
@@ -252,12 +254,6 @@ def _find_registered(client: MlflowClient, spec: str, uri: str) -> str:
         known = ", ".join(map(str, versions))
         raise InputError(f"model={spec}: {name} has no version {wanted}; known: {known}")
     return client.get_model_version_download_uri(name, str(wanted))
-
-
-def _check_quote(name: str) -> str:
-    if "'" in name:
-        raise InputError(f"model=models:/{name}: a name with a quote cannot be looked up")
-    return name
 
 
 def _fetch(source: str, spec: str, uri: str) -> Path:

@@ -48,7 +48,7 @@ def fit(
     ``mean_imu_error`` (6) of the training segments is where a model with ``known_from=training`` starts; ``notes`` are
     stored beside the weights. Raises InputError where no epoch had a finite ``monitor``.
     """
-    plan = settings.trainer
+    plan, monitor, best = settings.trainer, _monitor(settings.trainer.monitor, data), folder / BEST
     module = FilterTraining(settings.model, settings.loss, settings.descent, settings.seed)
     last = folder / LAST
     if settings.finetune:
@@ -68,7 +68,7 @@ def fit(
                 *settings.callbacks,
                 TrainingProgress(),
                 LossHistory(str(folder)),
-                BestWeights(str(folder), _monitor(plan.monitor, data), plan.best_from_epoch, notes),
+                BestWeights(str(folder), monitor, plan.best_from_epoch, notes),
                 ResumePoint(str(folder), plan.checkpoint_every),
             ],
             gradient_clip_val=plan.gradient_clip,
@@ -87,16 +87,11 @@ def fit(
             raise (end.__context__ if isinstance(end.__context__, KeyboardInterrupt) else end) from None
     if trainer.interrupted:
         raise KeyboardInterrupt
-    if is_worker():
-        return folder / BEST
-    loss = trainer.callback_metrics.get("train/loss")
-    if not (folder / BEST).is_dir() and loss is not None and not bool(loss.isfinite()):
-        raise InputError(f"the training diverged (its loss is {float(loss)}); give a smaller optimizer.lr")
-    if not (folder / BEST).is_dir():
-        monitor = _monitor(plan.monitor, data)
-        score = float(trainer.callback_metrics.get(monitor, math.nan))
-        raise InputError(f"no weights to keep: {monitor} is {score}, the training diverged; lower optimizer.lr")
-    return folder / BEST
+    if is_worker() or best.is_dir():
+        return best
+    loss, score = (float(trainer.callback_metrics.get(name, math.nan)) for name in ("train/loss", monitor))
+    what = f"no weights to keep: {monitor} is {score}" if math.isfinite(loss) else f"the loss is {loss}"
+    raise InputError(f"{what}: the training diverged; give a smaller optimizer.lr")
 
 
 def warm_start(model: LearnedFilter, data: DriveDataModule, mean_imu_error: Sequence[float] | None) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -53,23 +54,24 @@ class TrackingSettings:
 
 
 @dataclass(frozen=True)
-class BaselineSettings:
+class BaselineSettings(Ranged, where="baselines"):
     """Which filters are scored beside, on how many training segments they are tuned, and from which factors on."""
 
     models: Sequence[str]
     tune: bool
-    segments: int | None
-    rounds: int
+    segments: int | None = bounded_field(60, 1, math.inf)
+    rounds: int = bounded_field(2, 0, 1000)
     tuning: Tuning = field(default_factory=Tuning)
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         for name in self.models:
             if not (is_filter(name) or shipped_folder(name)):
                 raise InputError(f"baselines.models: unknown filter {name!r}; a Kalman filter's name, ins or plus")
 
 
 @dataclass(frozen=True)
-class ScoringSettings:
+class ScoringSettings(Ranged, where="scoring"):
     """The test: outages, rows after longer GNSS and over an hour, the bias that is injected."""
 
     seed: int
@@ -77,12 +79,8 @@ class ScoringSettings:
     after_s: Sequence[float]
     hour: str | None
     gains: bool
-    settle_s: float
     injected_bias: BiasLaw | None
-
-    def __post_init__(self) -> None:
-        if self.settle_s < 0:
-            raise InputError(f"scoring.settle_s is {self.settle_s!r}, must be 0 or more")
+    settle_s: float = bounded_field(10.0, 0, math.inf)
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,9 @@ Nothing here looks at validation or test drives (R018; paper.md 4.6).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import cache
 from itertools import product
 from typing import Any, NamedTuple
 
@@ -16,7 +17,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dlkf.base.console import show_progress, warn_once
+from dlkf.base.console import ProgressCallback, show_progress, warn_once
 from dlkf.base.errors import InputError
 from dlkf.data.drive import Batch
 from dlkf.evaluation.metrics import PVA, end_errors, geometric_mean, mean_error, segment_errors
@@ -103,16 +104,15 @@ def tune_filter(
     objective: str = "log",
     rounds: int = 2,
     prior: Prior | None = None,
-    progress: Callable[[Trial], None] | None = None,
-) -> tuple[Tuning, float]:
+    progress: ProgressCallback | None = None,
+) -> tuple[Tuning, float, list[Trial]]:
     """Over-bounding factors of a filter by coordinate search on training segments.
 
     A factor goes up its values, or down them, until two in a row are worse; nothing is tried twice. From an hour of
     segments on trials run compiled (:mod:`dlkf.onboard`), which is the same to rounding; where they cannot, a line
-    has the reason. ``prior`` is given to a filter with ``_prior``. Returns the best factors and their
-    :func:`evaluate_objective`; ``progress`` is called at every trial.
+    has the reason. ``prior`` is given to a filter with ``_prior``. Returns the best factors, their
+    :func:`evaluate_objective`, and the trials; ``progress`` gets how many they are and can be at most.
     """
-    known: dict[Tuning, float] = {}
     best = start or Tuning()
 
     def build(trial: Tuning) -> Estimator:
@@ -120,16 +120,15 @@ def tune_filter(
 
     in_c = _fits_c(build(best), batches)
 
+    @cache
     def evaluate(trial: Tuning) -> float:
-        if trial not in known:
-            estimator = _in_c(build(trial), batches[0]) if in_c else build(trial)
-            known[trial] = evaluate_objective(estimator, batches, objective)
-        return known[trial]
+        return evaluate_objective(_in_c(build(trial), batches[0]) if in_c else build(trial), batches, objective)
 
-    score = evaluate(best)
+    score, factors, trials = evaluate(best), factors or list_factors(name), list[Trial]()
+    most = rounds * sum(map(len, factors.values()))
     for _ in range(rounds):
         before = best
-        for factor, values in (factors or list_factors(name)).items():
+        for factor, values in factors.items():
             now = getattr(best, factor)
             up, down = sorted(v for v in values if v > now), sorted((v for v in values if v < now), reverse=True)
             for side in (up, down):
@@ -137,8 +136,9 @@ def tune_filter(
                 for value in side:
                     trial = replace(best, **{factor: value})
                     error = evaluate(trial)
+                    trials.append(Trial(factor, value, error))
                     if progress is not None:
-                        progress(Trial(factor, value, error))
+                        progress(len(trials), most)
                     worse = 0 if error < score else worse + 1
                     if error < score:
                         best, score = trial, error
@@ -148,22 +148,15 @@ def tune_filter(
                     break
         if best == before:
             break
-    return best, score
+    return best, score, trials
 
 
 def tune_under_bar(
     imu: ImuSpec, batches: Sequence[Batch], name: str, rounds: int, **options: Any
 ) -> tuple[Tuning, float, list[Trial]]:
-    """:func:`tune_filter` under a bar, for it takes minutes on much data; the trials, too."""
-    most, trials = rounds * sum(map(len, list_factors(name).values())), list[Trial]()
+    """:func:`tune_filter` under a bar, for it takes minutes on much data."""
     with show_progress(f"Tuning {name}") as bar:
-
-        def tell(trial: Trial) -> None:
-            trials.append(trial)
-            bar(len(trials), most)
-
-        best, score = tune_filter(imu, batches, name=name, rounds=rounds, progress=tell, **options)
-    return best, score, trials
+        return tune_filter(imu, batches, name=name, rounds=rounds, progress=bar, **options)
 
 
 def _in_c(estimator: Estimator, batch: Batch) -> CompiledFilter:

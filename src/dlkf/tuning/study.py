@@ -1,4 +1,5 @@
-"""Fit a filter's over-bounding factors on training drives and check them on test drives (R016, R018)."""
+"""Fit a filter's over-bounding factors on training drives and check them on test drives (R016, R018); what that, or
+noise found without a reference, leaves behind."""
 
 from __future__ import annotations
 
@@ -7,6 +8,8 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from types import MappingProxyType
+from typing import Any
 
 import pandas as pd
 import yaml
@@ -23,9 +26,10 @@ from dlkf.evaluation.table import ResultTable, as_markdown, format_number
 from dlkf.filters.build import build_causal, has_prior, is_filter
 from dlkf.filters.tuning import FittedOn, Prior, Tuning
 from dlkf.navigation.imu_errors import ImuSpec
+from dlkf.running.likelihood import NO_OFFSET, NoiseFit
 from dlkf.tuning.search import Trial, evaluate_objective, tune_under_bar
 
-LIKELIHOOD = "likelihood"  # the objective that needs no reference (dlkf.tuning.found)
+LIKELIHOOD = "likelihood"  # the objective that needs no reference (dlkf.running.likelihood)
 OF_OUTAGES = "log, rms, median: horizontal error at the end of the outages [m], geometric mean, RMS, median over them."
 OF_SEGMENTS = (
     "pva: geometric mean of the RMS of position [m], velocity [m/s] and attitude [rad] over each segment. "
@@ -179,17 +183,47 @@ def describe_compared(side: str, kind: str, count: int, drives: int) -> str:
     return many + (", too few to conclude from." if side == "test" and count < FEW else ".")
 
 
+def noise_table(model: str, dataset: str, imu: ImuSpec, tuning: Tuning, found: NoiseFit) -> ResultTable:
+    """Every value before and after, of noise that was found without a reference."""
+    before, after = NoiseFit(imu, tuning, NO_OFFSET, NO_OFFSET, 0.0, 0.0).describe(), found.describe()
+    return ResultTable(
+        title=f"{model} on {dataset}: noise under which the fixes are most likely",
+        note=f"SI units; mean −ln p of a fix {format_number(found.before)} before, {format_number(found.after)} after. "
+        f"No reference was used. {found.describe_offset()}".strip(),
+        columns=["Value", f"As {imu.name}", "Found"],
+        rows=[[key, format_number(before[key]), format_number(after[key])] for key in after],
+    )
+
+
+def write_noise(out: str | Path, found: NoiseFit, table: ResultTable, fitted_on: FittedOn) -> list[str]:
+    """Write imu/<name>.yaml, tuning/<name>.yaml and table.md into ``out``, all or none; their names."""
+    factors = found.tuning.factors() | {"fitted_on": asdict(fitted_on)}
+    name = found.imu.name
+    return _write(out, table, {f"imu/{name}": found.imu.as_preset(), f"tuning/{name}": factors})
+
+
 def write_tuning(
     out: str | Path, name: str, result: TuningResult, table: ResultTable, fitted_on: FittedOn
 ) -> list[str]:
-    """Write tuning/<name>.yaml, table.md and search.csv into ``out``, all or none; their names."""
-    values = result.after.factors() | {"fitted_on": asdict(fitted_on)}
-    factors = f"# {table.title}\n{yaml.safe_dump(values, sort_keys=False)}"
+    """Write tuning/<name>.yaml, table.md, search.csv and errors.json into ``out``, all or none; their names."""
+    factors = result.after.factors() | {"fitted_on": asdict(fitted_on)}
     trials = pd.DataFrame(result.trials, columns=["factor", "value", "objective"])
+    more = {
+        "search.csv": trials.to_csv(index=False, lineterminator="\n"),
+        "errors.json": json.dumps(result.metrics(), indent=1) + "\n",
+    }
+    return _write(out, table, {f"tuning/{name}": factors}, more)
+
+
+def _write(
+    out: str | Path, table: ResultTable, presets: Mapping[str, Any], more: Mapping[str, str] = MappingProxyType({})
+) -> list[str]:
+    """Presets under the table's title, table.md and ``more`` files, all or none; their names."""
+    head = f"# {table.title}\n"
+    files = {f"{key}.yaml": head + yaml.safe_dump(values, sort_keys=False) for key, values in presets.items()}
+    files |= {"table.md": as_markdown(table), **more}
     with write_into(out) as folder:
-        (folder / "tuning").mkdir()
-        (folder / "tuning" / f"{name}.yaml").write_text(factors, encoding="utf-8")
-        (folder / "table.md").write_text(as_markdown(table), encoding="utf-8")
-        trials.to_csv(folder / "search.csv", index=False, lineterminator="\n")
-        (folder / "errors.json").write_text(json.dumps(result.metrics(), indent=1) + "\n", encoding="utf-8")
-    return [f"tuning/{name}.yaml", "table.md", "search.csv"]
+        for name, text in files.items():
+            (folder / name).parent.mkdir(exist_ok=True)
+            (folder / name).write_text(text, encoding="utf-8")
+    return list(files)

@@ -25,7 +25,7 @@ from dlkf.base.settings import Ranged, bounded_field
 from dlkf.navigation.attitude import rotation_from_rpy, rpy_from_rotation
 from dlkf.navigation.earth import NOMINAL_GRAVITY
 from dlkf.simulation.motion.routes import Kinematics
-from dlkf.simulation.motion.shaking import Shaking, shake_mount
+from dlkf.simulation.motion.shaking import Shaking, resonance, shake_mount
 from dlkf.simulation.motion.vehicle import Route, Truth, Waves, radians_per_metre, random_waves
 
 Array = NDArray[np.floating]
@@ -220,13 +220,12 @@ def suspension(
     motion = route.motion(nodes)
     forward, right = loads(route, motion)
     load = np.stack((-car.roll_gradient * right, car.pitch_gradient * forward, np.zeros_like(nodes)), -1)
-    w, z = 2 * math.pi * car.kind.body_hz, car.kind.body_damping
-    body = _filter([w * w], [1, 2 * z * w, w * w], load)
-    if car.kind.roughness > 0:
-        road = rough_road(rng, car.kind, motion.distance, stretches)
-        u, y = 2 * math.pi * car.kind.wheel_hz, car.kind.wheel_damping
-        wheels = _filter([u * u], [1, 2 * y * u, u * u], road)
-        body += _filter([2 * z * w, w * w], [1, 2 * z * w, w * w], wheels)
+    kind = car.kind
+    body = _filter(resonance(kind.body_hz, kind.body_damping, NODE_HZ), load)
+    if kind.roughness > 0:
+        road = rough_road(rng, kind, motion.distance, stretches)
+        wheels = _filter(resonance(kind.wheel_hz, kind.wheel_damping, NODE_HZ), road)
+        body += _filter(resonance(kind.body_hz, kind.body_damping, NODE_HZ, at_base=True), wheels)
     return scipy.interpolate.make_interp_spline(nodes, body, k=5)
 
 
@@ -272,9 +271,9 @@ def vibration(rng: np.random.Generator, kind: ChassisConfig, motion: Kinematics)
     return shake, change
 
 
-def _filter(numerator: list[float], denominator: list[float], x: Array) -> Array:
-    """Columns of x (N, k) at the nodes through a transfer function in s, from the steady state of x₀."""
-    b, a = scipy.signal.bilinear(numerator, denominator, NODE_HZ)
+def _filter(coefficients: tuple[Array, Array], x: Array) -> Array:
+    """Columns of x (N, k) at the nodes through a filter (b, a), from the steady state of x₀."""
+    b, a = coefficients
     return scipy.signal.lfilter(b, a, x, axis=0, zi=scipy.signal.lfilter_zi(b, a)[:, None] * x[:1])[0]
 
 

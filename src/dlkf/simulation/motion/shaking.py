@@ -30,6 +30,7 @@ ENGINE_ORDERS = ((1.0, 0.6), (0.5, 0.25), (2.0, 0.15))  # of the firing frequenc
 WHEEL_ORDERS = ((1.0, 0.7), (2.0, 0.3))
 SOURCES = ("engine", "wheel", "hum", "rumble", "rattle")
 BURST_S = 0.1  # s
+RATTLE_DAMPING = 0.08
 LIMIT = 5.0  # m/s², RMS per axis of a source that nothing exceeds: a mount has stops, and a driver has ears
 NOISE_TURN_HZ = 15.0  # frequency at which noise turns the mount by ``turning``
 
@@ -260,10 +261,10 @@ def noise(rng: np.random.Generator, kind: Shaking, envelope: Array) -> Array:
     x = _filter_by_mount(kind, np.asarray(scipy.signal.lfilter(b, a, white, axis=0)) / _acceleration_rms(b, a))
     if kind.rattle > 0 and kind.rattle_per_minute > 0:
         knocks = rng.random(count) < kind.rattle_per_minute / 60 / NODE_HZ
-        w, z = 2 * math.pi * kind.rattle_hz, 0.08
-        b, a = scipy.signal.bilinear([w * w], [1.0, 2 * z * w, w * w], NODE_HZ)
+        w = 2 * math.pi * kind.rattle_hz
         height = kind.rattle / w**2 * np.exp(0.6 * rng.standard_normal((count, 6))) * rng.choice((-1, 1), (count, 6))
-        hit = np.asarray(scipy.signal.lfilter(b, a, knocks[:, None] * height, axis=0))
+        ringing = resonance(kind.rattle_hz, RATTLE_DAMPING, NODE_HZ)
+        hit = np.asarray(scipy.signal.lfilter(*ringing, knocks[:, None] * height, axis=0))
         x += _filter_by_mount(kind, hit * NODE_HZ / w)
     return x
 
@@ -277,9 +278,15 @@ def _acceleration_rms(b: Array, a: Array) -> float:
 def _filter_by_mount(kind: Shaking, x: Array) -> Array:
     if kind.mount_hz == 0:
         return x
-    w, z = 2 * math.pi * kind.mount_hz, kind.mount_damping
-    b, a = scipy.signal.bilinear([2 * z * w, w * w], [1.0, 2 * z * w, w * w], NODE_HZ)
-    return np.asarray(scipy.signal.lfilter(b, a, x, axis=0))
+    mount = resonance(kind.mount_hz, kind.mount_damping, NODE_HZ, at_base=True)
+    return np.asarray(scipy.signal.lfilter(*mount, x, axis=0))
+
+
+def resonance(hz: float, damping: float, node_hz: float, *, at_base: bool = False) -> tuple[Array, Array]:
+    """The filter (b, a) at nodes of a mass on a spring that a force moves, ω²/(s² + 2ζωs + ω²), or its base,
+    (2ζωs + ω²)/(s² + 2ζωs + ω²)."""
+    w, z = 2 * math.pi * hz, damping
+    return scipy.signal.bilinear([2 * z * w, w * w] if at_base else [w * w], [1.0, 2 * z * w, w * w], node_hz)
 
 
 def gain(kind: Shaking, f: Array) -> Array:
@@ -301,9 +308,8 @@ def sway(
     forward, right = load(nodes)
     share = rng.uniform(0.3, 1.0, 3) * (1, 1, 0.5)
     asked = kind.sway * share * np.stack((-right, forward, right), -1)
-    w, z = 2 * math.pi * kind.sway_hz, kind.sway_damping
-    b, a = scipy.signal.bilinear([w * w], [1.0, 2 * z * w, w * w], NODE_HZ / 2)
-    return scipy.interpolate.make_interp_spline(nodes, scipy.signal.lfilter(b, a, asked, axis=0), k=5)
+    swinging = resonance(kind.sway_hz, kind.sway_damping, NODE_HZ / 2)
+    return scipy.interpolate.make_interp_spline(nodes, scipy.signal.lfilter(*swinging, asked, axis=0), k=5)
 
 
 def limit_amplitude(size: Array) -> Array:
