@@ -122,6 +122,10 @@ BAD = {
     "us of 32 bits": (_set("imu", "t", lambda t: (t + 4260) % 4294.967296), r"wraps_s=4294.967296"),
     "another counter": (_set("imu", "t", lambda t: (t + 1) % 20), r"t goes back .*wraps_s=20$"),
     "clock set back": (_set("imu", "t", lambda t: np.where(t > 30, t - 20, t)), "the clock was set back there"),
+    "stamps of a host that gets packets of four": (
+        _set("imu", "t", lambda t: np.ceil(np.arange(1, len(t) + 1) / 4) * 0.04 + 1e-4 * (np.arange(len(t)) % 4)),
+        "75 % of the samples came with the one before, .*respace=true",
+    ),
     "duplicate stamp": (_set("imu", "t", lambda t: _at(100, t[99])(t)), "row 100: t = 1.0.* appears twice"),
     "ms taken for s": (_set("imu", "t", lambda t: 1000 * t), "row.* a second, an IMU has 1 to 10000: .*imu.time.unit"),
     "ns taken for s": (_set("imu", "t", lambda t: 1e9 * t), "reader.imu.time.unit"),

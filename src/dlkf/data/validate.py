@@ -12,6 +12,7 @@ import pandas as pd
 from dlkf.base.errors import InputError
 from dlkf.data.aid_checks import check_aid
 from dlkf.data.aid_tables import STANDARD, AidTable
+from dlkf.data.bursts import MANY, share_at_once
 from dlkf.data.dead_sensors import check_frozen
 from dlkf.data.discovery.motion import find_motion
 from dlkf.data.limits import FULL_SCALE, NONE_REFUSED, Refused, screen_fixes, within_full_scale
@@ -229,6 +230,11 @@ def _check_imu(imu: Columns, where: str, limits: Limits) -> Columns:
     """The samples within full scale, where the others are few."""
     t = imu["t"]
     check_time(t, where)
+    if (share := share_at_once(t)) > MANY:
+        raise InputError(
+            f"{where}: {100 * share:.0f} % of the samples came with the one before, as in packets that a host stamps; "
+            "give the sensor's own stamps, or spread the samples evenly (reader.imu.time.respace=true)"
+        )
     remedy = "remove the row or split the drive there"
     refuse_rows(imu, (*GYRO, *ACCEL), lambda x: ~np.isfinite(x), where, remedy)
     if len(t) < 2:
