@@ -248,6 +248,10 @@ def test_more_that_tables_have():
     frame = pd.DataFrame({"t": t, **{f"{s}{a}": 0.0 for s in ("acc_", "gyr_") for a in "xyz"}}).assign(acc_z=-9.8)
     spec = imu_spec(LogTable(frame, Path("a")))
     assert spec is not None and spec.spec["time"]["respace"] is True and "spread evenly" in spec.notes[0]
+    of_packets = frame.assign(t=50.0 * (np.arange(200) // 5) + 0.1 * np.arange(200))
+    spec = imu_spec(LogTable(of_packets, Path("a")))
+    assert spec is not None and spec.spec["time"] == {"column": "t", "unit": "ms", "respace": True}
+    assert spec.notes[0].startswith("80 % of the samples came in a packet")
 
 
 @pytest.mark.parametrize(

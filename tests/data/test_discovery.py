@@ -229,6 +229,25 @@ def test_a_drift_over_a_long_drive_is_told(drive):
         check_clocks(imu | {"t": imu["t"] * 1.02}, gnss, "drive")
 
 
+@pytest.mark.parametrize(("late_s", "turned", "said"), [(0.0, 0, ""), (5.0, 0, "5.0 s apart"), (0.0, 90, "turned by")])
+def test_coarse_positions_alone_show_another_clock_or_a_turned_sensor(streets, late_s, turned, said):
+    """Half a metre of noise in a position a second: differences are noise, lines through five seconds are not."""
+    noise = 0.5 / 111e3 * np.random.default_rng(4).standard_normal((len(streets["gnss"]), 2))
+    gnss = streets["gnss"].assign(t=streets["gnss"].t + late_s, **dict.fromkeys(VELOCITY, np.nan))
+    gnss[["lat_deg", "lon_deg"]] += noise
+    gnss = gnss.iloc[:: max(1, round(1 / np.median(np.diff(gnss.t))))]
+    turn = Rotation.from_euler("Z", turned, degrees=True).as_matrix()
+    imu = streets["imu"].copy()
+    for axes in (ACCEL, GYRO):
+        imu[list(axes)] = imu[list(axes)].to_numpy() @ turn
+    tables = [{c: frame[c].to_numpy() for c in frame} for frame in (imu, gnss)]
+    if not said:
+        check_clocks(*tables, "drive")
+        return
+    with pytest.raises(InputError, match=said):
+        check_clocks(*tables, "drive")
+
+
 def test_a_lever_arm_is_seen(drive):
     """Antenna 1.2 m before and 0.5 m left of the IMU: velocities of the antenna are those of the IMU plus ω × l."""
     imu, gnss = drive["imu"], drive["gnss"].copy()

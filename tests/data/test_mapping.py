@@ -230,6 +230,17 @@ def test_equal_stamps(tmp_path, tables):
     assert spread_stamps(np.repeat([1.0, 2.0, 3.0, 9.0], 2)).tolist() == [0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 7.5, 9.0]
 
 
+def test_stamps_of_packets(tmp_path, tables):
+    """A host that gets ten samples at a time stamps them 0.2 ms apart, here as a packet's last one is taken."""
+    imu = tables["imu"]
+    place = np.arange(len(imu))
+    arrived = imu.t.to_numpy()[np.minimum(place // 10 * 10 + 9, len(imu) - 1)] + 2e-4 * (place % 10 - 9)
+    imu.assign(t=arrived).to_csv(tmp_path / "imu.csv", index=False)
+    drive = read(tmp_path, tables, imu__time={"column": "t", "respace": True})
+    whole = len(imu) // 10 * 10
+    np.testing.assert_allclose(drive.imu.t[:whole], imu.t[:whole], atol=1e-9)
+
+
 def test_a_pose_in_degrees(tmp_path, tables):
     turn = Rotation.from_euler("ZYX", [90.0, -20.0, 5.0], degrees=True).as_matrix()
     odd = tables["imu"].copy()

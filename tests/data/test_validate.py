@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 
 from dlkf.base.errors import InputError
-from dlkf.data.plausibility import check_imu_units
+from dlkf.data.plausibility import check_gnss_units, check_imu_units
 from dlkf.data.readers.units import LENGTH
 from dlkf.data.schema import drive_file, write_drive, write_drives_table
 from dlkf.data.store import load_dataset
@@ -122,6 +122,10 @@ BAD = {
     "us of 32 bits": (_set("imu", "t", lambda t: (t + 4260) % 4294.967296), r"wraps_s=4294.967296"),
     "another counter": (_set("imu", "t", lambda t: (t + 1) % 20), r"t goes back .*wraps_s=20$"),
     "clock set back": (_set("imu", "t", lambda t: np.where(t > 30, t - 20, t)), "the clock was set back there"),
+    "stamps of a host that gets packets of four": (
+        _set("imu", "t", lambda t: np.ceil(np.arange(1, len(t) + 1) / 4) * 0.04 + 1e-4 * (np.arange(len(t)) % 4)),
+        "75 % of the samples came with the one before, .*respace=true",
+    ),
     "duplicate stamp": (_set("imu", "t", lambda t: _at(100, t[99])(t)), "row 100: t = 1.0.* appears twice"),
     "ms taken for s": (_set("imu", "t", lambda t: 1000 * t), "row.* a second, an IMU has 1 to 10000: .*imu.time.unit"),
     "ns taken for s": (_set("imu", "t", lambda t: 1e9 * t), "reader.imu.time.unit"),
@@ -136,6 +140,8 @@ BAD = {
     "no fixes": (_rows("gnss", lambda f: f.iloc[:0]), "has no rows"),
     "no fix at all": (_set("gnss", "quality", lambda q: 0 * q), "no GNSS fix at all"),
     "degrees per second": (_columns("imu", _scale(GYRO, 180 / np.pi)), "looks like degrees"),
+    "velocities of 0 that are unknown": (_columns("gnss", _scale(["vel_n", "vel_e"], 0.0)), "are 0 in every row .*NaN"),
+    "a gyroscope of another range": (_columns("imu", _scale(GYRO, 0.5)), "0.50 times .*multiply gyro by 2"),
     "radians taken for degrees": (_columns("imu", _scale(GYRO, np.pi / 180)), "gyro_z is 0.017.*not in rad/s"),
     "g": (_columns("imu", _scale(ACCEL, 1 / 9.80665)), "looks like g; reader.imu.accel.unit=g"),
     "no gravity": (_columns("imu", _scale(["accel_z"], 0.01)), "median specific force"),
@@ -177,6 +183,42 @@ def test_bad_numbers(tmp_path, tables, case):
     import re
 
     assert re.search(expected, text), text
+
+
+ALONE = ["vel_n", "vel_e", "vel_d"]
+MIRRORED = {
+    "gyro z up": _columns("imu", _scale(["gyro_z"], -1)),
+    "swapped position": _columns("gnss", _swap("lat_deg", "lon_deg")),
+    "west of Greenwich": _columns("gnss", _scale(["lon_deg"], -1)),
+}
+
+
+@pytest.mark.parametrize("case", MIRRORED)
+def test_positions_alone_show_turns_the_other_way(tmp_path, tables, case):
+    """As they show those of a sensor in another unit; half a metre of noise hides neither, and is no fault itself."""
+    noise = 0.5 / 111e3 * np.random.default_rng(2).standard_normal((len(tables["gnss"]), 2))
+    gnss = tables["gnss"].assign(**dict.fromkeys(ALONE, np.nan))
+    gnss[["lat_deg", "lon_deg"]] += noise
+    alone = {**tables, "gnss": gnss}
+    _write(tmp_path, alone)
+    validate_dataset(tmp_path)
+    _write(tmp_path, MIRRORED[case]({k: v for k, v in alone.items() if k != "reference"}))
+    said = _complaint(tmp_path, reference=False)
+    assert "gyro_z turns against the course" in said and "latitude and longitude are exchanged" in said
+    _write(tmp_path, _columns("imu", _scale(GYRO, 180 / np.pi / 10))(alone))
+    assert "times the turn of the course" in _complaint(tmp_path)
+
+
+def test_swapped_positions_of_a_drive_along_the_diagonal(tmp_path, tables):
+    """Mostly north-east at 48° north: exchanged they are off by a third in the median."""
+    t = tables["gnss"].t.to_numpy()
+    north, east = np.cumsum(np.full(len(t), 9.0)), np.cumsum(np.where(np.arange(len(t)) % 20 < 15, 7.0, 0.5))
+    gnss = tables["gnss"].assign(lat_deg=48.0 + np.degrees(north / 6.37e6), vel_n=9.0, vel_e=np.diff(east, prepend=0.0))
+    gnss = gnss.assign(lon_deg=9.0 + np.degrees(east / 6.38e6 / np.cos(np.radians(48.0))))
+    check_gnss_units({c: gnss[c].to_numpy() for c in gnss}, "here")
+    exchanged = gnss.rename(columns={"lat_deg": "lon_deg", "lon_deg": "lat_deg"})
+    with pytest.raises(InputError, match="latitude and longitude look swapped"):
+        check_gnss_units({c: exchanged[c].to_numpy() for c in exchanged}, "here")
 
 
 def hilly(gnss: pd.DataFrame, unit_m: float, noise_m: float) -> pd.DataFrame:

@@ -287,6 +287,12 @@ FAULTS: dict[str, tuple[Fault, tuple[str, ...]]] = {
     "positions alone, one in seven 3 m off": (lambda sent: JUMPY(ALONE(sent)), ()),
     "positions alone that scatter by two metres": (lambda sent: SCATTERED(ALONE(sent)), ()),
     "positions that scatter by two metres": (SCATTERED, ()),
+    "one velocity in three fixes": (
+        _changed("gnss", lambda t: round(t) % 3 > 0, lambda x: _put(x, 4, WITHOUT_VELOCITY)), ()),
+    "no velocities for ten seconds, twice": (
+        _changed("gnss", lambda t: round(t) % 20 > 9, lambda x: _put(x, 4, WITHOUT_VELOCITY)), ()),
+    "velocities of unknown 1σ": (
+        _changed("gnss", lambda t: True, lambda x: _put(x, 5, [*x[5][:3], 99.0, 99.0, 99.0])), ()),
     "coarse positions alone": (COARSE, ()),
     "coarse positions alone, 3 s late": (lambda sent: _late(3.0)(COARSE(sent)), ("replayed",)),
     "fixes of the other hemisphere": (

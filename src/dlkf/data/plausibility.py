@@ -14,7 +14,7 @@ from dlkf.base.errors import InputError
 from dlkf.data.dead_sensors import check_dead_axes
 from dlkf.data.discovery.clock import ImuSums, Lag, describe_offset, find_lag
 from dlkf.data.discovery.drift import ROUGH_S, compare_ends, find_drifting_pose, find_step
-from dlkf.data.discovery.motion import Motion, find_motion, stretches
+from dlkf.data.discovery.motion import Motion, find_motion, fit_motion, stretches
 from dlkf.data.discovery.units import compare_climbs, nearest_unit
 from dlkf.data.limits import DEGREE_M, NOWHERE_DEG
 from dlkf.data.readers.units import LENGTH
@@ -25,7 +25,8 @@ from dlkf.navigation.earth import SEMI_MAJOR
 FORCE, UPRIGHT = (7.0, 13.0), 0.7  # m/s², the median specific force; the share of it along −z
 FASTEST_RATE = 20.0  # rad/s: no car turns, and no bump shakes it, that fast for a thousandth of a drive
 DISAGREES, AGREES = 0.4, 0.25  # relative residual of way against velocity
-LEAST_SLOPE = 0.1  # of gyro_z against the course; one that is at its limit in every turn may have 0.3
+SUSPECT, CLEARLY = 0.15, 0.25  # less than DISAGREES, but more than a quarter of which another reading has
+MOVED_M = 100.0  # positions of a car that moves
 UNITS = (  # that velocities may be in, the remedy, m/s per unit
     ("like km/h", "divide them by 3.6", 1 / 3.6),
     ("like knots", "multiply them by 0.5144", 0.514444),
@@ -153,6 +154,7 @@ def _check_way(gnss: Columns, where: str) -> None:
         return
     step = np.diff(t)
     whole = np.isfinite(v_n) & np.isfinite(v_e)
+    _check_unknown(lat, lon, v_n[whole], v_e[whole], where)
     smooth = (step <= 2.0) & whole[1:] & whole[:-1]
     way_n, way_e = (
         np.concatenate(([0.0], np.cumsum(np.where(smooth, step * (v[1:] + v[:-1]) / 2, 0.0)))) for v in (v_n, v_e)
@@ -169,7 +171,8 @@ def _check_way(gnss: Columns, where: str) -> None:
         way = SEMI_MAJOR * np.stack((lat[last] - lat[first], np.cos(lat[first]) * turn), -1)
         return float(np.median(np.linalg.norm(way - moved, axis=-1) / np.linalg.norm(moved, axis=-1)))
 
-    if residual(lat, lon, moved) < DISAGREES:
+    given = residual(lat, lon, moved)
+    if given < SUSPECT:
         return
     readings = {
         "latitude and longitude look swapped; exchange lat_deg and lon_deg": (lon, lat, moved),
@@ -186,12 +189,25 @@ def _check_way(gnss: Columns, where: str) -> None:
     }
     fits = {text: residual(*reading) for text, reading in readings.items()}
     best = min(fits, key=lambda text: fits[text])
-    if fits[best] < AGREES:
+    if fits[best] < (AGREES if given > DISAGREES else CLEARLY * given):
         raise InputError(f"{where}: positions and velocities disagree: {best}")
-    if np.ptp(v_e[whole]) == 0 or np.ptp(v_n[whole]) == 0:
+    if given > DISAGREES and (np.ptp(v_e[whole]) == 0 or np.ptp(v_n[whole]) == 0):
         raise InputError(
             f"{where}: positions and velocities disagree: vel_n and vel_e must count North and East, not along the "
             "car; leave them out, or give speed and course (reader.gnss.velocity.frame=course)"
+        )
+
+
+def _check_unknown(lat: np.ndarray, lon: np.ndarray, v_n: np.ndarray, v_e: np.ndarray, where: str) -> None:
+    """Velocities of 0 in every row of a drive that moves are none."""
+    if not len(v_n) or v_n.any() or v_e.any():
+        return
+    east = np.cos(lat[0]) * wrap_angle(lon - lon[0])
+    way = SEMI_MAJOR * float(np.hypot(np.ptp(lat), np.ptp(east)))
+    if way > MOVED_M:
+        raise InputError(
+            f"{where}: vel_n and vel_e are 0 in every row though positions move by {way:.0f} m: write NaN where a "
+            "velocity is not known, or leave the columns out"
         )
 
 
@@ -214,41 +230,6 @@ def _check_climb(gnss: Columns, where: str) -> None:
     raise InputError(f"{where}: heights change {climb.slope:.3g} times as much as the vertical velocity says: {remedy}")
 
 
-def check_turns(imu: Columns, gnss: Columns, where: str) -> None:
-    """Integrated gyro_z against the change of course between fixes, where the drive turns enough."""
-    t, course = gnss["t"], np.arctan2(gnss["vel_e"], gnss["vel_n"])
-    speed = np.hypot(gnss["vel_n"], gnss["vel_e"])
-    angle = np.concatenate(([0.0], np.cumsum(imu["gyro_z"][1:] * np.diff(imu["t"]))))
-    with np.errstate(invalid="ignore"):
-        use = (np.diff(t) <= 1.5) & (speed[1:] > 3) & (speed[:-1] > 3)
-        use &= (t[1:] <= imu["t"][-1]) & (t[:-1] >= imu["t"][0])
-    turned = wrap_angle(np.diff(course))[use]
-    gyro = np.diff(np.interp(t, imu["t"], angle))[use]
-    clear = np.abs(turned) > 0.1
-    turned, gyro = turned[clear], gyro[clear]
-    if len(turned) < 3 or np.abs(turned).sum() < 1.0 or np.ptp(imu["gyro_z"]) == 0:
-        return
-    slope = float(turned @ gyro / (turned @ turned))
-    alike = abs(float(turned @ gyro)) / float(np.linalg.norm(turned) * np.linalg.norm(gyro))
-    if alike < 0.9:
-        return
-    if slope > 20:
-        raise InputError(
-            f"{where}: gyro_z is {slope:.0f} times the turn of the course: looks like degrees; use rad/s "
-            "(reader.imu.gyro.unit=deg/s)"
-        )
-    if not LEAST_SLOPE < abs(slope) < 1 / LEAST_SLOPE:
-        raise InputError(
-            f"{where}: gyro_z is {slope:.3g} times the turn of the course: not in rad/s, or of another axis; "
-            "reader.imu.gyro.unit=auto finds its unit"
-        )
-    if slope < 0:
-        raise InputError(
-            f"{where}: gyro_z turns against the course (slope {slope:.2f}): z must point down; "
-            "turn the signs of y and z"
-        )
-
-
 def check_clocks(imu: Columns, gnss: Columns, where: str) -> None:
     """The yaw rate and the horizontal force agree with GNSS as the clocks stand, or at no offset clearly better.
 
@@ -259,6 +240,9 @@ def check_clocks(imu: Columns, gnss: Columns, where: str) -> None:
     sums = ImuSums.of(t, accel, gyro)
     _check_drift(sums, moved, where)
     best = find_lag(sums, moved, SEARCH_S)
+    if (best is None or not best.certain) and not np.isfinite(gnss["vel_n"]).any():
+        moved = fit_motion(gnss)
+        best = find_lag(sums, moved, SEARCH_S)
     _check_handedness(t, accel, gyro, moved, best, where)
     if best is None or not best.certain:
         return

@@ -12,14 +12,16 @@ import pandas as pd
 from dlkf.base.errors import InputError
 from dlkf.data.aid_checks import check_aid
 from dlkf.data.aid_tables import STANDARD, AidTable
+from dlkf.data.bursts import MANY, share_at_once
 from dlkf.data.dead_sensors import check_frozen
 from dlkf.data.discovery.motion import find_motion
 from dlkf.data.limits import FULL_SCALE, NONE_REFUSED, Refused, screen_fixes, within_full_scale
-from dlkf.data.plausibility import check_clocks, check_gnss_units, check_imu_units, check_turns
+from dlkf.data.plausibility import check_clocks, check_gnss_units, check_imu_units
 from dlkf.data.readers.units import DAY_S, GPS_EPOCH_UNIX, WEEK_S
 from dlkf.data.reference_checks import check_attitude, check_same_clock, check_same_place
 from dlkf.data.schema import ACCEL, ATTITUDE, GYRO, POSITION, STD, VELOCITY, stack_columns
 from dlkf.data.tables import Columns, DriveRow, read_drives, read_table, refuse_rows
+from dlkf.data.turn_checks import check_turns
 
 GNSS_QUALITIES = (1, 2, 3, 4, 5, 9)  # NMEA GGA codes that are a satellite fix; 6, 7, 8 are not
 RATES_HZ = {"imu": (1.0, 1e4), "gnss": (1e-3, 500.0)}
@@ -101,7 +103,7 @@ def check_tables(tables: CheckedTables, limits: Limits = LIMITS) -> CheckedTable
     if any(refused):
         tables = replace(tables, imu=imu, gnss=gnss, refused=refused)
     check_frozen(imu, read_fixes(gnss), _where(name, "imu"))
-    check_turns(imu, gnss, _where(name, "imu"))
+    check_turns(imu, read_fixes(gnss), _where(name, "imu"))
     check_clocks(imu, read_fixes(gnss), _where(name, "imu"))
     if truth is not None:
         _check_reference(truth, imu, read_fixes(gnss), _where(name, "reference"))
@@ -229,6 +231,11 @@ def _check_imu(imu: Columns, where: str, limits: Limits) -> Columns:
     """The samples within full scale, where the others are few."""
     t = imu["t"]
     check_time(t, where)
+    if (share := share_at_once(t)) > MANY:
+        raise InputError(
+            f"{where}: {100 * share:.0f} % of the samples came with the one before, as in packets that a host stamps; "
+            "give the sensor's own stamps, or spread the samples evenly (reader.imu.time.respace=true)"
+        )
     remedy = "remove the row or split the drive there"
     refuse_rows(imu, (*GYRO, *ACCEL), lambda x: ~np.isfinite(x), where, remedy)
     if len(t) < 2:

@@ -1,6 +1,7 @@
 """Velocity of the antenna at epoch boundaries: the receiver's, or one fitted to its positions.
 
-A receiver without velocities has them fitted to the positions of :data:`FIT_S`. With north + i east as one complex
+A receiver without velocities has them fitted to the positions of :data:`FIT_S`, and so has one that gives them with no
+more than half of these positions, or with a 1σ that says that they are unknown. With north + i east as one complex
 number and α(t) the yaw from the boundary back to t by the gyroscopes, a car that does not slip has the velocity
 v(t) = e^{iα(t)} (z − w τ), τ = t_end − t, so
 
@@ -51,6 +52,8 @@ READ_S = FIT_S + 2 * CONFIRMED_S  # before a boundary
 JOLT_STD = 0.3  # m/s, that second differences of a car's velocity are taken for
 LEAST_DIFFERENCES = 3  # that show a scatter
 SECOND_DIFFERENCE = 12 * math.log(2)  # median of its square over the variance of an axis
+LEAST_FITTED = 3  # positions that a velocity is fitted to
+UNKNOWN_STD = 10.0  # m/s: a velocity of this 1σ or more is none
 DIFFERENCE = 2 * math.log(2)  # the same of a difference of positions, over the variances of an axis at both ends
 
 
@@ -67,10 +70,30 @@ class AntennaVelocity(NamedTuple):
 
 
 def antenna_velocity(drive: Drive, C_en: Float[Tensor, "rows 3 3"], down_b: Float[Tensor, "rows 3"]) -> AntennaVelocity:
-    """The receiver's velocity, or if it has none anywhere one fitted to positions; ``down_b``: n's down in b."""
+    """The receiver's velocity, or where it has few one fitted to positions; ``down_b``: n's down in b."""
+    few = _few_velocities(drive)
+    if torch.compiler.is_compiling() or not bool(few.any()):
+        return _read_velocity(drive, C_en, down_b)
+    fitted = _fit_velocity(drive, C_en, down_b)
+    if bool(few.all()):
+        return fitted
+    read = _read_velocity(drive, C_en, down_b)
+    return AntennaVelocity(*(torch.where(few[:, None] if x.dim() > 1 else few, x, y) for x, y in zip(fitted, read)))
+
+
+def _few_velocities(drive: Drive) -> Bool[Tensor, " rows"]:
+    """Boundaries before which there are enough fixes in ``FIT_S``, and no more than half of them have a velocity."""
+    position = drive.gnss_valid[:, :3].all(-1)
+    given = position & drive.gnss_valid[:, 3:5].all(-1) & (drive.gnss_std[:, 3:5].amax(-1) < UNKNOWN_STD)
+    back = max(2, round(FIT_S / drive.epoch_s)) + 1
+    counts = pad(torch.stack((position, given)).to(torch.int64).cumsum(-1), (back, 0))
+    positions, velocities = counts[:, back:] - counts[:, :-back]
+    return (positions >= LEAST_FITTED) & (2 * velocities <= positions)
+
+
+def _read_velocity(drive: Drive, C_en: Float[Tensor, "rows 3 3"], down_b: Float[Tensor, "rows 3"]) -> AntennaVelocity:
+    """The receiver's, where it is no outlier."""
     known = drive.gnss_valid[:, 3:]
-    if not torch.compiler.is_compiling() and not bool(known[:, :2].any()):
-        return _fit_velocity(drive, C_en, down_b)
     v_n = torch.where(known, (C_en.mT @ drive.gnss_v_e.unsqueeze(-1)).squeeze(-1), 0.0)
     std = torch.where(known, drive.gnss_std[:, 3:], _vertical_std(v_n).unsqueeze(-1))
     before = _count_confirming(drive)
@@ -200,7 +223,7 @@ def _fit_velocity(drive: Drive, C_en: Float[Tensor, "rows 3 3"], down_b: Float[T
     down = _fit(level, r_n[..., 2], weight, torch.stack((torch.full_like(slope, 1e-9), slope**-2), -1))
     v_n[:, 2] = down.found[:, 1]
 
-    moves = fixed[:, 0] & (fixed.sum(-1) >= 3) & (velocity.abs() > MOTION_SIGMAS * spread)
+    moves = fixed[:, 0] & (fixed.sum(-1) >= LEAST_FITTED) & (velocity.abs() > MOTION_SIGMAS * spread)
     moving = _confirm_motion(moves, _count_confirming(drive))
     one = torch.ones_like(scatter)
     off = (x[:, :1] @ fit.found.unsqueeze(-1))[:, 0, 0].abs() / (1 - fit.own[:, 0]).clamp_min(LEAST_SHARE)

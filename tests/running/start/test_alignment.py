@@ -92,6 +92,37 @@ def test_without_velocities_positions_do(drive):
     assert (v.abs() < 3 * std[:, 3:6]).all()
 
 
+@pytest.mark.parametrize(
+    "said",
+    ["one fix in three has a velocity", "every other fix has one", "unknown ones are 99 m/s 1σ", "a stop has them"],
+)
+def test_few_velocities_are_as_none(drive, said):
+    """No two in a row have one, or none while the car moves: without the positions there was no start at all."""
+    rows, known, std = torch.arange(drive.epochs + 1), torch.arange(6) < 3, drive.gnss_std
+    if said == "unknown ones are 99 m/s 1σ":
+        known, std = known | True, torch.where(known, std, 99.0)
+    else:
+        given = {"one": rows % 3 == 1, "every": rows % 2 == 1, "a": rows < 1}[said.split()[0]]
+        known = known | given[:, None]
+    few = replace(drive, gnss_valid=drive.gnss_valid & known, gnss_std=std)
+    attitude, _, v, std = _errors(few, align_boundaries(few))
+    assert len(attitude) >= 55  # 56 without any
+    assert attitude.abs().max() < 2.0 and v.norm(dim=-1).max() < 0.5
+    assert (v.abs() < 3 * std[:, 3:6]).all()
+
+
+def test_velocities_that_are_lost_for_a_while_are_those_of_the_receiver_before_and_after(drive):
+    """Ten seconds of positions alone: there they count, elsewhere nothing changes to the bit."""
+    rows = torch.arange(drive.epochs + 1)
+    lost = (rows >= 25) & (rows < 35)
+    some = replace(drive, gnss_valid=drive.gnss_valid & ~(lost[:, None] & (torch.arange(6) > 2)))
+    whole, found = align_boundaries(drive), align_boundaries(some)
+    assert found.ok[30:35].all()
+    away = (rows < 25) | (rows > 44)
+    assert torch.equal(found.ok[away], whole.ok[away])
+    assert torch.equal(found.C_eb[away & whole.ok], whole.C_eb[away & whole.ok])
+
+
 def test_positions_alone_that_wait_for_their_boundary_do_too(drive):
     """Stamps of a host, a receiver on another clock: no fix is on a boundary, each up to 0.9 s before."""
     lag = 0.1 + 0.8 * torch.rand(len(drive.gnss_lag), generator=torch.Generator().manual_seed(8), dtype=torch.float64)
@@ -302,7 +333,7 @@ def test_a_start_reads_no_more_of_a_drive_than_it_needs(drive, known, config, mo
     for first in (1000, 5):
         monkeypatch.setattr(entry, "FIRST_EPOCHS", first)
         starts.append(align(moved, replace(config, search_s=config.search_s / 4)))
-    assert epochs[0] == drive.epochs and (epochs[-1] < drive.epochs) == (late != 40)
+    assert epochs[0] == drive.epochs and (epochs[-1] < drive.epochs) == (known != "fixes late")
     a, b = ([*start.state, start.std, torch.tensor([start.first, start.lat, start.height])] for start in starts)
     near = 1e-12 if known in ("positions", "velocities late") else 0.0  # batched products of other sizes
     assert all(torch.allclose(x, y, rtol=near, atol=near) for x, y in zip(a, b, strict=True))

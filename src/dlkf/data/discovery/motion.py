@@ -6,6 +6,7 @@ Horizontal vectors are complex numbers: North + i East, or forward + i right.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -21,6 +22,7 @@ Complex = NDArray[np.complexfloating]
 MOVING, RESTING = 2.0, 0.3  # m/s: above, the course is known; below, the car stands
 LONGEST_STEP_S = 2.5  # fixes further apart make no interval
 PHASES = 5  # intervals that overlap: of fixes at 50 Hz one from every fix would say no more, and take long
+FIT_S = 5.0  # of positions that have a velocity together
 SHORTEST_STEP_S = 0.45  # of faster fixes intervals span several: the noise of a difference grows with its rate
 
 
@@ -105,6 +107,26 @@ def _from_positions(t: Floats, lat_deg: Floats, lon_deg: Floats) -> Motion:
     fine = (step > 0) & (step <= LONGEST_STEP_S)
     middle = 0.5 * (t[1:] + t[:-1])[fine]
     return Motion(middle, moved[fine] / step[fine], np.zeros(int(fine.sum())))
+
+
+def fit_motion(fixes: Columns | pd.DataFrame) -> Motion:
+    """Velocities from straight lines through the positions of :data:`FIT_S` around each fix: of coarse positions, whose
+    differences are noise; turns and braking are smoothed."""
+    t, lat_deg, lon_deg = (np.asarray(fixes[c]) for c in ("t", "lat_deg", "lon_deg"))
+    place = np.concatenate(([0.0], np.cumsum(displacements(lat_deg, lon_deg))))
+    s = t - t[0]
+    before, after = np.searchsorted(t, t - FIT_S / 2 - 1e-6), np.searchsorted(t, t + FIT_S / 2 + 1e-6)
+    count = after - before
+
+    def mean(x: np.ndarray) -> Any:
+        total = np.concatenate(([0.0], np.cumsum(x)))
+        return (total[after] - total[before]) / count
+
+    middle, spread = mean(s), mean(s * s) - mean(s) ** 2
+    v = (mean(s * place) - middle * mean(place)) / np.maximum(spread, 1e-9)
+    full = spread > (0.9 * FIT_S) ** 2 / 12  # no gap nearby, no end of the log
+    good = full & (count >= 4) & (np.abs(middle - s) < 0.1 * FIT_S)
+    return Motion(t[good], v[good], np.zeros(int(good.sum())), stride=_stride(t[good]))
 
 
 def position_delay(fixes: Columns | pd.DataFrame) -> tuple[float, float]:

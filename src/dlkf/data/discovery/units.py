@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from dlkf.data.bursts import MANY, share_at_once, usual_interval
 from dlkf.data.discovery.motion import Floats, displacements, stretches
 from dlkf.navigation.earth import STANDARD_GRAVITY as G
 
@@ -117,6 +118,7 @@ def time_unit(values: Floats, slowest_s: float, fastest_s: float) -> str | None:
     step = step[step > 0]
     if not len(step):
         return None
-    usual = float(np.median(step))
+    packets = share_at_once(numbers) > MANY
+    usual = usual_interval(numbers) if packets else float(np.median(step))
     fits = [unit for unit, ticks in TICKS.items() if fastest_s <= usual / ticks <= slowest_s]
     return fits[0] if len(fits) == 1 else None

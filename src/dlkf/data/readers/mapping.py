@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 
 from dlkf.base.errors import InputError, did_you_mean, list_some
+from dlkf.data.bursts import follow_at_once
 from dlkf.data.readers import units
 from dlkf.data.readers.frames import LogTable
 
@@ -291,9 +292,11 @@ def _find_empty(cells: pd.DataFrame) -> pd.DataFrame:
 
 
 def spread_stamps(t: np.ndarray) -> np.ndarray:
-    """Rows of one stamp spread evenly over the time since the stamp before (a clock coarser than the rate)."""
-    first = np.flatnonzero(np.diff(t, prepend=-np.inf) != 0)
+    """Rows of one stamp, or of one packet, spread evenly over the time since the stamp before (a clock coarser than the
+    rate, or that of a host)."""
+    first = np.flatnonzero(~follow_at_once(t))
     count = np.diff(first, append=len(t))
+    t = np.repeat(t[first + count - 1], count)  # of a packet's end
     steps = np.diff(t[first])
     usual = float(np.median(steps / count[1:])) if len(steps) else 0.0
     since = np.concatenate(([usual * count[0]], np.minimum(steps, 3 * usual * count[1:]))) if len(first) else steps

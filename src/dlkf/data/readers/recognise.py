@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
+from dlkf.data.bursts import MANY, share_at_once
 from dlkf.data.discovery.units import accel_units
 from dlkf.data.limits import DEGREE_M, EARTH_M
 from dlkf.data.readers import by_numbers, stamps, units, vocabulary
@@ -74,15 +75,21 @@ def imu_spec(table: LogTable, named: Mapping[str, list[str]] = NONE_NAMED) -> Re
 
 
 def _spread(frame: pd.DataFrame, time: Spec) -> tuple[str, ...]:
-    """Asks for samples of one and the same stamp to be spread, where a clock is coarser than the rate."""
+    """Asks for samples of one stamp, or of one packet, to be spread: a clock coarser than the rate, or a host's."""
     column = time.get("column")
     if not isinstance(column, str) or column not in frame or not pd.api.types.is_numeric_dtype(frame[column]):
         return ()
-    same = float((np.diff(frame[column].to_numpy(float)) == 0).mean()) if len(frame) > 1 else 0.0
-    if same < COARSE:
+    t = frame[column].to_numpy(float)
+    same, packed = float((np.diff(t) == 0).mean()) if len(t) > 1 else 0.0, share_at_once(t)
+    if same < COARSE and packed < MANY:
         return ()
     time["respace"] = True
-    return (f"{100 * same:.0f} % of the samples have the stamp of the one before: spread evenly (time.respace=true)",)
+    said = (
+        f"{100 * same:.0f} % of the samples have the stamp of the one before"
+        if same >= COARSE
+        else f"{100 * packed:.0f} % of the samples came in a packet with the one before"
+    )
+    return (f"{said}: spread evenly (time.respace=true)",)
 
 
 def sensor_spec(table: LogTable, called: str) -> dict[str, Spec]:

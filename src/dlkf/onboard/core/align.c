@@ -186,7 +186,7 @@ static int fit_velocity(const dlkf *d, int64_t number, int64_t first, boundary *
     if (!(s.largest > OUTLIER_SIGMAS * OUTLIER_SIGMAS * others)) break;
     at[s.worst].weight = 0;
   }
-  if (s.fixes < 3 || !(at[0].weight > 0)) return 0;
+  if (s.fixes < LEAST_FITTED || !(at[0].weight > 0)) return 0;
   const double squares = s.squares / (s.fixes > 4 ? 2 * s.fixes - 7 : 1);
   b->scatter[0] = squares > 1 ? sqrt(squares) : 1;
   const double *row = at[0].row;
@@ -312,26 +312,41 @@ static double scatter_of_positions(const dlkf *d, int64_t number, int64_t first,
   return root_of_median(squares, found);
 }
 
-/* Velocity of the antenna at a boundary with its 1-sigma; where no fix has any, from positions, if by those of a second
- * before the car moved too. 0 where it is none, or an outlier. */
-static int read_boundary(const dlkf *d, int64_t number, int64_t first, int velocities, boundary *b) {
-  boundary before;
-  if (velocities) {
-    if (!read_velocity(d, number, b) || !agrees(d, number, first, b)) return 0;
-    b->scatter[1] = scatter_of_velocities(d, number, first);
-    b->scatter[0] = scatter_of_positions(d, number, first, b->scatter);
-    for (int k = 0; k < 2; k++) b->std[k] = dlkf_scattered(b->std[k], b->scatter, 1);
-    return 1;
+/* Whether of the fixes of FIT_S before a boundary no more than half have a velocity, and enough have a position. */
+static int few_velocities(const dlkf *d, int64_t number, int64_t first) {
+  int positions = 0, velocities = 0;
+  for (int j = 0; j <= DLKF_FITTED && number - j >= first; j++) {
+    const dlkf_fix *fix = dlkf_fix_at(d, number - j);
+    if (!has_position(fix)) continue;
+    positions++;
+    velocities += fix->used[3] && fix->used[4] && fix->std[3] < UNKNOWN_STD && fix->std[4] < UNKNOWN_STD;
   }
+  return positions >= LEAST_FITTED && 2 * velocities <= positions;
+}
+
+/* The velocity of the receiver at a boundary, where it is no outlier, with the 1-sigma that it scatters by. */
+static int read_received(const dlkf *d, int64_t number, int64_t first, boundary *b) {
+  if (!read_velocity(d, number, b) || !agrees(d, number, first, b)) return 0;
+  b->scatter[1] = scatter_of_velocities(d, number, first);
+  b->scatter[0] = scatter_of_positions(d, number, first, b->scatter);
+  for (int k = 0; k < 2; k++) b->std[k] = dlkf_scattered(b->std[k], b->scatter, 1);
+  return 1;
+}
+
+/* Velocity of the antenna at a boundary with its 1-sigma; where few fixes have any, from positions, if by those of a
+ * second before the car moved too. 0 where it is none, or an outlier. */
+static int read_boundary(const dlkf *d, int64_t number, int64_t first, boundary *b) {
+  boundary before;
+  if (!few_velocities(d, number, first)) return read_received(d, number, first, b);
   return find_boundary(d, number, b) && fit_velocity(d, number, first, b) && number - DLKF_CONFIRMED >= first &&
          find_boundary(d, number - DLKF_CONFIRMED, &before) && fit_velocity(d, number - DLKF_CONFIRMED, first, &before);
 }
 
 /* Whether the car moves, and did a second before. */
-static int is_moving(const dlkf *d, int64_t number, int64_t first, int velocities, const boundary *now) {
+static int is_moving(const dlkf *d, int64_t number, int64_t first, const boundary *now) {
   boundary before;
-  return !velocities || (moves(now) && number - DLKF_CONFIRMED >= first &&
-                         read_boundary(d, number - DLKF_CONFIRMED, first, 1, &before) && moves(&before));
+  return few_velocities(d, number, first) || (moves(now) && number - DLKF_CONFIRMED >= first &&
+                                              read_received(d, number - DLKF_CONFIRMED, first, &before) && moves(&before));
 }
 
 /* A start at the beginning of a closed update interval: latitude, longitude [rad], height [m] of the IMU, velocity (3)
@@ -342,16 +357,12 @@ static int is_moving(const dlkf *d, int64_t number, int64_t first, int velocitie
 int dlkf_align(const dlkf *d, int64_t epoch, double *start, double *u_b, double *scatter) {
   const int64_t first = epoch - d->oldest > DLKF_LOOKBACK ? epoch - DLKF_LOOKBACK : d->oldest;
   const double *arm = d->lever_arm_b;
-  int velocities = 0;
-  for (int64_t k = first; k <= epoch + 1; k++) {
-    const dlkf_fix *fix = dlkf_fix_at(d, k);
-    velocities |= fix && (fix->used[3] || fix->used[4]);
-  }
   boundary now, then;
   if (epoch - BACK < first) return 0;
-  if (velocities && !(read_velocity(d, epoch, &now) && hypot(now.v_n[0], now.v_n[1]) > MIN_SPEED)) return 0; /* quick */
-  if (!read_boundary(d, epoch, first, velocities, &now) || !is_moving(d, epoch, first, velocities, &now)) return 0;
-  if (!read_boundary(d, epoch - BACK, first, velocities, &then)) return 0;
+  if (!few_velocities(d, epoch, first) && !(read_velocity(d, epoch, &now) && hypot(now.v_n[0], now.v_n[1]) > MIN_SPEED))
+    return 0; /* quick */
+  if (!read_boundary(d, epoch, first, &now) || !is_moving(d, epoch, first, &now)) return 0;
+  if (!read_boundary(d, epoch - BACK, first, &then)) return 0;
   const double lag = now.lag, lag_then = then.lag, span = BACK * EPOCH_S - lag + lag_then;
   const double speed = hypot(now.v_n[0], now.v_n[1]), slow = speed > 0.1 ? speed : 0.1;
   const double noise = noise_of(&now);

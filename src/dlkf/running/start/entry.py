@@ -244,20 +244,16 @@ def _first_motion(drive: Drive, config: AlignConfig, earliest: int) -> FirstMoti
 def _align_until_motion(drive: Drive, config: AlignConfig, earliest: int) -> tuple[Aligned, int | None]:
     """Alignment at the boundaries up to ``search_s`` after the first motion from ``earliest`` on, and where that is.
 
-    A boundary's alignment reads what is before it, and whether the drive has velocities at all. Of a drive that never
-    moves all boundaries, and None.
+    A boundary's alignment reads what is before it. Of a drive that never moves all boundaries, and None.
     """
-    velocities = bool(drive.gnss_valid[:, 3:5].any())
     ahead, search = FIRST_EPOCHS, round(config.search_s / drive.epoch_s)
     while True:
         end = min(earliest + ahead, drive.epochs)
-        part = drive.part(0, end)
-        if end == drive.epochs or bool(part.gnss_valid[:, 3:5].any()) == velocities:
-            aligned = align_boundaries(part, config)
-            moving = torch.nonzero(aligned.ok[earliest:end]).flatten()
-            row = earliest + int(moving[0]) if len(moving) else None
-            if end == drive.epochs or (row is not None and row + search < end):
-                return aligned, row
+        aligned = align_boundaries(drive.part(0, end), config)
+        moving = torch.nonzero(aligned.ok[earliest:end]).flatten()
+        row = earliest + int(moving[0]) if len(moving) else None
+        if end == drive.epochs or (row is not None and row + search < end):
+            return aligned, row
         ahead *= 4
 
 
