@@ -6,6 +6,7 @@ import sys
 import pytest
 
 import dlkf
+from dlkf import ui
 from dlkf.base.config import config_dir
 from dlkf.command import GROUPS
 from dlkf.command.help import MOST, describe_key, help_text, list_groups, list_keys
@@ -52,6 +53,15 @@ def test_keys_are_read_with_value_and_comment():
     assert describe_key(text, "start.yaw_deg")[0] == "2.0"
     with pytest.raises(KeyError):
         describe_key(text, "none")
+
+
+@pytest.mark.parametrize("option", ["--help", "-h"])
+def test_mlflows_pages_say_their_keys(option, capsys, monkeypatch):
+    """``dlkf --help`` promises it for every command; this one has no file in ``conf/``."""
+    monkeypatch.setattr(sys, "argv", ["dlkf", option])
+    ui.main()
+    said = capsys.readouterr()
+    assert all(f"  {key}=" in said.out for key in ("port", "host", "uri")) and not said.err
 
 
 @pytest.mark.parametrize("word", ["null", "none", "off"])
