@@ -23,7 +23,7 @@ from dlkf.data.store import dataset_digest
 from dlkf.evaluation.protocol import drives_that_fit
 from dlkf.evaluation.summary import describe_verdict, headline
 from dlkf.evaluation.table import as_rich, result_tables
-from dlkf.tracking.grid import PARENT_RUN, run_name, take_over_point
+from dlkf.tracking.grid import PARENT_RUN, keep_point, run_name
 from dlkf.tracking.registry import check_registration, log_model
 from dlkf.tracking.runs import check_store, lightning_logger, start_run, tracking_uri
 from dlkf.training.fit import check_fit
@@ -58,7 +58,8 @@ def main(config: dict[str, Any]) -> None:
     if is_worker():
         train_with_baselines(settings, data, folder)
         return
-    if given.resume and (done := finished_before(folder, data.datasets, config)) and take_over_point(uri, done):
+    name, parent = run_name(given.name, overrides), os.environ.get(PARENT_RUN)
+    if parent and given.resume and (done := finished_before(folder, data.datasets, config)) and keep_point(uri, done):
         console.print(f"finished already, in a grid search that broke off: MLflow run {done}")
         return
     check_fit(settings.fit, data)
@@ -73,7 +74,6 @@ def main(config: dict[str, Any]) -> None:
         console.print(line, style="yellow", highlight=False)
     if state:
         console.print(f"resuming the unfinished run in {folder}")
-    name, parent = run_name(given.name, overrides), os.environ.get(PARENT_RUN)
     begun = start_run(uri, given.name, name, parent_run_id=parent, run_id=state.get("run_id"))
     with hold_folder(folder), begun as run:
         write_state(folder, run_id=run.id, **check_digests(data.datasets, config, state))

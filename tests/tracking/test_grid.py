@@ -19,7 +19,7 @@ from dlkf.base.processes import MACHINE
 from dlkf.command.sweeps import job_folder
 from dlkf.tracking.comparison import best_validation, monitored_metric
 from dlkf.tracking.endings import PROCESS_TAG
-from dlkf.tracking.grid import PARENT_RUN, GridParent, parent_status, run_name, swept_overrides, take_over_point
+from dlkf.tracking.grid import PARENT_RUN, GridParent, keep_point, parent_status, run_name, swept_overrides
 from dlkf.tracking.runs import mlflow_module, start_run
 from tests.shell import PATIENCE_S
 
@@ -111,7 +111,7 @@ def test_a_grid_given_again_keeps_the_points_that_finished(uri, client):
     broken.on_multirun_start(task)
     first = os.environ[PARENT_RUN]
     done = point(uri, "done", 5.0)
-    assert not take_over_point(uri, done.id), "it runs still"
+    assert not keep_point(uri, done.id), "it runs still"
     atexit.unregister(broken.close)
     client.set_tag(first, PROCESS_TAG, f"{MACHINE}-0-1")
 
@@ -119,15 +119,15 @@ def test_a_grid_given_again_keeps_the_points_that_finished(uri, client):
     again.on_multirun_start(task)
     assert client.get_run(first).info.status == "KILLED"
     second = os.environ[PARENT_RUN]
-    assert take_over_point(uri, done.id) and not take_over_point(uri, "0" * 32)
+    assert keep_point(uri, done.id) and not keep_point(uri, "0" * 32)
     assert client.get_run(done.id).data.tags["mlflow.parentRunId"] == second
     again.on_multirun_end(OmegaConf.create())
     assert client.get_run(second).info.status == "FINISHED"
-    assert not take_over_point(uri, done.id), "no grid search runs"
+    assert not keep_point(uri, done.id), "no grid search runs"
 
     third = GridParent()
     third.on_multirun_start(task)
-    assert not take_over_point(uri, done.id)
+    assert not keep_point(uri, done.id)
     third.close(ended=False)
 
 

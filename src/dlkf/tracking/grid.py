@@ -135,7 +135,7 @@ class GridParent(Callback):
         client.set_tag(parent, "best_run_id", best.info.run_id)
 
 
-def take_over_point(uri: str, run_id: str) -> bool:
+def keep_point(uri: str, run_id: str) -> bool:
     """Put a finished run under the grid search that runs here if its own one failed or was killed; whether it did."""
     if (parent := os.environ.get(PARENT_RUN)) is None:
         return False
