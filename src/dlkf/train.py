@@ -23,12 +23,12 @@ from dlkf.data.store import dataset_digest
 from dlkf.evaluation.protocol import drives_that_fit
 from dlkf.evaluation.summary import describe_verdict, headline
 from dlkf.evaluation.table import as_rich, result_tables
-from dlkf.tracking.grid import PARENT_RUN, run_name
+from dlkf.tracking.grid import PARENT_RUN, keep_point, run_name
 from dlkf.tracking.registry import check_registration, log_model
 from dlkf.tracking.runs import check_store, lightning_logger, start_run, tracking_uri
 from dlkf.training.fit import check_fit
 from dlkf.training.processes import is_worker
-from dlkf.training.run_folder import check_digests, hold_folder, run_folder, write_state
+from dlkf.training.run_folder import check_digests, finished_before, hold_folder, run_folder, write_state
 from dlkf.training.settings import TrainSettings, drop_unused
 from dlkf.training.study import (
     key_metrics,
@@ -58,6 +58,10 @@ def main(config: dict[str, Any]) -> None:
     if is_worker():
         train_with_baselines(settings, data, folder)
         return
+    name, parent = run_name(given.name, overrides), os.environ.get(PARENT_RUN)
+    if parent and given.resume and (done := finished_before(folder, data.datasets, config)) and keep_point(uri, done):
+        console.print(f"finished already, in a grid search that broke off: MLflow run {done}")
+        return
     check_fit(settings.fit, data)
     if given.scoring.outage is not None:
         drives_that_fit(given.scoring.outage, data.eval_length_s, "data.eval_length_s", "scoring.outage")
@@ -65,14 +69,11 @@ def main(config: dict[str, Any]) -> None:
     data.setup()
     simulate_missing([given.scoring.hour] if given.scoring.hour else [], console, HOUR_SEED)
     console.print(data.describe())
-    for line in list_left_out_drives(settings, data):
-        console.print(f"left out: {line}", style="yellow", highlight=False)
-    for line in list_seen_recordings(settings, data):
+    left_out = [f"left out: {line}" for line in list_left_out_drives(settings, data)]
+    for line in [*left_out, *list_seen_recordings(settings, data)]:
         console.print(line, style="yellow", highlight=False)
     if state:
         console.print(f"resuming the unfinished run in {folder}")
-    name = run_name(given.name, overrides)
-    parent = os.environ.get(PARENT_RUN)
     begun = start_run(uri, given.name, name, parent_run_id=parent, run_id=state.get("run_id"))
     with hold_folder(folder), begun as run:
         write_state(folder, run_id=run.id, **check_digests(data.datasets, config, state))
@@ -90,8 +91,7 @@ def main(config: dict[str, Any]) -> None:
         log_model(run, outcome.weights, metrics=key_metrics(outcome), **chosen)
         write_state(folder, finished=True)
     for result in outcome.results:
-        verdict = describe_verdict(result, outcome.name) or headline(result)
-        console.print(f"[bold]{verdict}[/bold]", highlight=False)
+        console.print(f"[bold]{describe_verdict(result, outcome.name) or headline(result)}[/bold]", highlight=False)
     seconds = ", ".join(f"{k} {v:.0f} s" for k, v in outcome.seconds.items())
     console.print(f"{seconds}\nReport: {folder}/report/report.html\nModel:  {outcome.weights}\nMLflow: run {run.id}")
 

@@ -12,13 +12,21 @@ import sys
 from dlkf.base.errors import InputError
 from dlkf.tracking.runs import open_client, store_missing, tracking_uri
 
+HELP = """MLflow's pages over the runs of this folder, until Ctrl-C:
+  python -m dlkf.ui
+  python -m dlkf.ui port=5001
+
+Keys (key=value):
+  port=5000
+  host=127.0.0.1  0.0.0.0: other machines, too, without a login
+  uri=null  null: mlflow.db here; or a store, as in tracking.uri"""
 PAGE = "/#/experiments{of}?workflowType=machine_learning"
 
 
 def main() -> None:
     """Start the server, print the links, stay until Ctrl-C."""
     if {"--help", "-h"} & set(sys.argv[1:]):
-        print(f"{__doc__}\nKeys: port=5000, host=127.0.0.1, uri=<MLflow store; of this folder by default>.")
+        print(HELP)
         return
     split = (argument.partition("=") for argument in sys.argv[1:])
     given = {key: value for key, _, value in split}

@@ -1,5 +1,6 @@
 """Grid search: parent run, children, final status, comparison; with sweeps that take no training."""
 
+import atexit
 import os
 import shutil
 import signal
@@ -14,9 +15,11 @@ import pytest
 from omegaconf import OmegaConf
 
 from dlkf.base.points import SWEPT, Failure, collect_failures, report_failure
+from dlkf.base.processes import MACHINE
 from dlkf.command.sweeps import job_folder
 from dlkf.tracking.comparison import best_validation, monitored_metric
-from dlkf.tracking.grid import PARENT_RUN, GridParent, parent_status, run_name, swept_overrides
+from dlkf.tracking.endings import PROCESS_TAG
+from dlkf.tracking.grid import PARENT_RUN, GridParent, keep_point, parent_status, run_name, swept_overrides
 from dlkf.tracking.runs import mlflow_module, start_run
 from tests.shell import PATIENCE_S
 
@@ -99,6 +102,33 @@ def test_children_that_were_cut_down_do_not_stay_running(uri, client):
     grid.close(ended=False)
     assert client.get_run(child.info.run_id).info.status == "FAILED"
     assert client.get_run(parent.info.run_id).info.status == "FAILED"
+
+
+def test_a_grid_given_again_keeps_the_points_that_finished(uri, client):
+    """After a kill, or where another point failed; of a grid search that finished every point is trained again."""
+    task = sweep_config(uri)
+    broken = GridParent()
+    broken.on_multirun_start(task)
+    first = os.environ[PARENT_RUN]
+    done = point(uri, "done", 5.0)
+    assert not keep_point(uri, done.id), "it runs still"
+    atexit.unregister(broken.close)
+    client.set_tag(first, PROCESS_TAG, f"{MACHINE}-0-1")
+
+    again = GridParent()
+    again.on_multirun_start(task)
+    assert client.get_run(first).info.status == "KILLED"
+    second = os.environ[PARENT_RUN]
+    assert keep_point(uri, done.id) and not keep_point(uri, "0" * 32)
+    assert client.get_run(done.id).data.tags["mlflow.parentRunId"] == second
+    again.on_multirun_end(OmegaConf.create())
+    assert client.get_run(second).info.status == "FINISHED"
+    assert not keep_point(uri, done.id), "no grid search runs"
+
+    third = GridParent()
+    third.on_multirun_start(task)
+    assert not keep_point(uri, done.id)
+    third.close(ended=False)
 
 
 def test_children_in_other_experiments_are_found(uri, client, capsys):

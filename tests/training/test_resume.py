@@ -19,7 +19,7 @@ from dlkf.data.masks import Outage
 from dlkf.filters.saved import parse_learned_settings
 from dlkf.training.fit import check_fit, fit
 from dlkf.training.module import FilterTraining
-from dlkf.training.run_folder import check_digests, hold_folder, read_state, run_folder, write_state
+from dlkf.training.run_folder import check_digests, finished_before, hold_folder, read_state, run_folder, write_state
 from dlkf.training.settings import FitSettings, TrainSettings, drop_unused
 from dlkf.training.study import list_seen_recordings, model_card
 from tests.shell import PATIENCE_S, start_fork
@@ -264,3 +264,15 @@ def test_run_folder_is_found_again_until_it_is_finished(tmp_path):
     write_state(folder, finished=True)
     assert read_state(folder) == {"run_id": "abc", "finished": True}
     assert found()[0].name == folder.name + "-2"
+
+
+def test_the_finished_training_before_a_new_folder_is_found(tmp_path):
+    """On the same data alone: other data make another training."""
+    one, two, three = (tmp_path / name for name in ("0123", "0123-2", "0123-3"))
+    assert finished_before(one, [], {}) is None
+    write_state(one, run_id="abc")
+    assert finished_before(two, [], {}) is None, "not finished"
+    write_state(one, finished=True)
+    assert finished_before(two, [], {}) == "abc" and finished_before(one, [], {}) is None, "one is no new folder"
+    write_state(two, run_id="def", finished=True, data={"town": "0"})
+    assert finished_before(three, [], {}) is None, "other data"

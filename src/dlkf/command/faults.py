@@ -93,8 +93,9 @@ def one_line(error: BaseException, command: str = "") -> str:
         return f"{key}={values}: several values are '{key}=[{values}]' as a list, or -m {key}={values} for a run each"
     if missing := re.search(r"Could not find '([^']+)'", text):
         options = re.search(r"Available options in '([^']+)':\n((?:\t.*\n?)+)", text)
-        near = did_you_mean(missing[1].rpartition("/")[2], options[2].split()) if options else ""
-        hint = f"{near or ';'} available in {options[1]}: {', '.join(options[2].split())}" if options else ""
+        names = [name for name in options[2].split() if not name.startswith("_")] if options else []
+        near = did_you_mean(missing[1].rpartition("/")[2], names)
+        hint = f"{near or ';'} available in {options[1]}: {', '.join(names)}" if options else ""
         hint += "" if near else "; --config-dir adds a folder of your own"
         return f"unknown preset or config {missing[1]!r}{hint}"
     if missing := re.search(r"Could not load '([^']+)'", text):

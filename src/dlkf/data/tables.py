@@ -66,9 +66,7 @@ def read_drives(folder: str | Path) -> list[DriveRow]:
         near = did_you_mean(folder.name, [p.name for p in beside]) or "; make one with dlkf.simulate or dlkf.ingest"
         raise InputError(f"dataset {folder}: no such folder{near}")
     if not whole:
-        above = folder.parent
-        place = f"it lies in {above}" if path_is_file(above / "drives.parquet") else "it holds one row per drive"
-        raise InputError(f"dataset {folder}: drives.parquet is missing; {place}")
+        raise InputError(f"dataset {folder}: drives.parquet is missing; {_find_dataset(folder)}")
     table = _read(path, "drives.parquet")
     for name in DRIVES_REQUIRED:
         if name not in table.column_names:
@@ -88,6 +86,16 @@ def read_drives(folder: str | Path) -> list[DriveRow]:
             )
     groups = [str(g) if g else name for g, name in zip(table["group"].to_pylist(), names)]
     return [DriveRow(n, g, (float(x), float(y), float(z))) for n, g, x, y, z in zip(names, groups, *arms)]
+
+
+def _find_dataset(folder: Path) -> str:
+    """Where the dataset is that a folder without one stands for: above it, in it, or yet to be made."""
+    if path_is_file(folder.parent / "drives.parquet"):
+        return f"it lies in {folder.parent}"
+    inside = [] if is_url(str(folder)) else sorted(str(path.parent) for path in folder.glob("*/drives.parquet"))
+    if inside:
+        return f"give a dataset in it: {list_some(inside)}"
+    return "it holds one row per drive; dlkf.ingest makes a dataset of logs"
 
 
 LATEST_S = 1e11  # of a clock that counts seconds from 1970, 1980 or when a logger was started

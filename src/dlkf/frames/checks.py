@@ -148,7 +148,7 @@ def _check_seconds(times: Mapping[str, np.ndarray]) -> None:
             if slowest < step <= slowest * factor:
                 count = ", or the numbers of the rows" if step == 1 else ""
                 raise InputError(
-                    f"{name}: a row every {step:g} s: t looks like {unit}{count}; divide it by {factor:.0e}"
+                    f"{name}: a row every {step:g} s: t looks like {unit}{count}; divide it by {factor:g}"
                     + (", or by the rate in Hz" if count else "")
                 )
 

@@ -22,16 +22,20 @@ from omegaconf import DictConfig, OmegaConf
 from dlkf.base.errors import InputError
 from dlkf.base.files import resolve_place
 from dlkf.base.points import SWEPT, Failure, failures
+from dlkf.base.processes import process_label
 from dlkf.report.compare import read_reports, write_comparison
 from dlkf.tracking.comparison import NAMELESS, as_text, best_child, children, compare_children, comparison
+from dlkf.tracking.endings import PROCESS_TAG, close_killed_runs
 from dlkf.tracking.registry import check_registration, register_model
 from dlkf.tracking.runs import (
     NOTE_TAG,
+    PARENT_TAG,
     TrackedRun,
     check_store,
     experiment_id,
     open_client,
     reachable,
+    run_exists,
     start_run,
     tracking_uri,
 )
@@ -62,7 +66,8 @@ class GridParent(Callback):
             with reachable(self.uri):
                 client = open_client(self.uri)
                 name = "grid " + (" × ".join(grid_name(*pair) for pair in swept.items()) or "of one point")
-                run = client.create_run(experiment_id(client, config.name), run_name=name[:250])
+                close_killed_runs(client, group := experiment_id(client, config.name))
+                run = client.create_run(group, run_name=name[:250], tags={PROCESS_TAG: process_label()})
         except InputError as error:  # Hydra would make a warning of it and go on
             print(f"dlkf: error: {error}", file=sys.stderr)
             raise SystemExit(2) from None
@@ -128,6 +133,24 @@ class GridParent(Callback):
         client.log_batch(parent, metrics=[Metric(k, v, now, 0) for k, v in scores.items()])
         client.set_tag(parent, "best_run", best.info.run_name)
         client.set_tag(parent, "best_run_id", best.info.run_id)
+
+
+def keep_point(uri: str, run_id: str) -> bool:
+    """Put a finished run under the grid search that runs here if its own one failed or was killed; whether it did."""
+    if (parent := os.environ.get(PARENT_RUN)) is None:
+        return False
+    with reachable(uri):
+        client = open_client(uri)
+        if not run_exists(client, run_id):
+            return False
+        run = client.get_run(run_id)
+        before = run.data.tags.get(PARENT_TAG)
+        if run.info.status != "FINISHED" or before is None or not run_exists(client, before):
+            return False
+        if client.get_run(before).info.status not in ("FAILED", "KILLED"):
+            return False
+        client.set_tag(run_id, PARENT_TAG, parent)
+    return True
 
 
 def parent_status(statuses: Sequence[str], ended: bool) -> str:

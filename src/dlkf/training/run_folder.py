@@ -52,6 +52,19 @@ def read_state(folder: Path) -> dict[str, Any]:
         return dict(json.loads(path.read_text()))
 
 
+def finished_before(folder: Path, datasets: Sequence[str], config: Mapping[str, Any]) -> str | None:
+    """MLflow run of the training before a new ``folder``, if that finished on the same data with the same own code."""
+    digest, _, attempt = folder.name.partition("-")
+    before = folder.with_name(f"{digest}-{int(attempt) - 1}" if attempt not in ("", "2") else digest)
+    if folder.exists() or not (state := read_state(before)).get("finished"):
+        return None
+    try:
+        check_digests(datasets, config, state)
+    except InputError:
+        return None
+    return str(state["run_id"])
+
+
 @contextmanager
 def _damaged_as_input_error(path: Path) -> Iterator[None]:
     """Whatever reading a file raises in the block but an OSError."""
