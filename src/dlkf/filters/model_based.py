@@ -219,10 +219,9 @@ class Mbkf:
         if memory.noise is not None:
             Q = torch.where(memory.noise.settled[:, None, None], memory.noise.Q, Q)
         predicted = kalman_prediction(memory.P, Phi, Q, walking=not self.gauss_markov)
-        prediction = Predicted(predicted, memory.structure, memory.noise)
+        named = {} if memory.parameters is None else self._name_parameters(memory.parameters)
+        prediction = Predicted(predicted, memory.structure, named)
         fix = self.fix.rows(epoch, memory.fix, memory.noise)
-        if memory.parameters is not None:
-            prediction = prediction._replace(parameters=self._name_parameters(memory.parameters))
         parts, sources, said = [fix], [], []
         for source, of_source in zip(self.sources, memory.sources, strict=True):
             rows, of_source = source.rows(epoch, of_source, prediction)

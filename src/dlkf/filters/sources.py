@@ -19,7 +19,6 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from dlkf.data.drive import Batch
-from dlkf.filters.adaptive import AdaptiveNoise
 from dlkf.filters.integration import Epoch
 from dlkf.filters.tuning import Tuning
 from dlkf.navigation.state import ErrorStates
@@ -49,7 +48,6 @@ class Predicted(NamedTuple):
 
     P: Tensor  # (B, n, n)
     structure: Tensor | None = None  # (B, 5) of the car, where it has such states
-    noise: AdaptiveNoise | None = None
     parameters: Mapping[str, Tensor] = {}  # (B,) each, of the sources by name
     rolling: Tensor | None = None  # (B,) bool: a wheel that agrees with the filter turns; None: no wheel
     stopped: Tensor | None = None  # (B,) bool: it agrees and does not turn
