@@ -19,8 +19,8 @@ from dlkf.command.scored import TuneSettings
 from dlkf.data.store import choose_aids, dataset_digest, load_dataset
 from dlkf.evaluation.outages import describe_rounding
 from dlkf.evaluation.table import as_markdown, as_rich
-from dlkf.filters.aids.attach import append_aids, refuse_left_out
-from dlkf.filters.build import build_filter
+from dlkf.filters.aids.attach import refuse_left_out
+from dlkf.filters.build import FilterName, build_filter
 from dlkf.filters.tuning import FittedOn
 from dlkf.onboard.compiled_filter import compile_or_keep
 from dlkf.running.likelihood import Evidence, find_noise
@@ -41,7 +41,7 @@ from dlkf.tuning.study import (
 def main(settings: TuneSettings) -> None:
     """Load, split, search, check, write, log, print."""
     chosen = choose_aids(settings.dataset, settings.aids, settings.drives)
-    model = append_aids(str(settings.model), [table.name for table in chosen])
+    model = FilterName.parse(str(settings.model)).add(table.name for table in chosen)
     name, spec, start = settings.name, settings.spec, settings.tuning
     check_settings(model, settings.objective)
     if settings.aids is not None:

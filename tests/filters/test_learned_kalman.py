@@ -57,6 +57,30 @@ def test_with_weights_of_zero_it_is_the_kalman_filter(base, form):
     assert torch.allclose(ours.innovation_covariance, theirs.innovation_covariance, rtol=1e-6)
 
 
+def test_an_innovation_that_is_left_out_has_its_own_variance():
+    """As that of the Kalman filter; a fix 1 km off that the coarse gate leaves out."""
+    batch = scene(2, 15, seed=4)
+    gnss = batch.gnss.clone()
+    gnss[:, 12, :3] += 1000.0
+    batch, said = replace(batch, gnss=gnss), []
+
+    class Watched:
+        def __init__(self, inner):
+            self.begin, self.inner, self.variances = inner.begin, inner, []
+
+        def step(self, memory, epoch):
+            memory, correction = self.inner.step(memory, epoch)
+            self.variances.append(correction.rejected)
+            return memory, correction
+
+    for inner in (without_heads(small("mbkf15")), build_filter("mbkf15", IMU, tuning=TUNING)):
+        watched = Watched(inner)
+        integrate(batch, watched)
+        said.append(watched.variances)
+    assert [k for k, x in enumerate(said[0]) if x is not None] == [12]
+    assert torch.allclose(said[0][12], said[1][12], rtol=1e-6) and bool((said[0][12] > 0).all())
+
+
 def test_covariance_with_a_further_gain_is_that_of_joseph_s_form():
     """P of the whole gain K + E on a fix beside a constraint, by P⁺ = (I − G H) P (I − G H)ᵀ + G R Gᵀ."""
     draw = torch.Generator().manual_seed(1)

@@ -1,39 +1,28 @@
-"""A source of measurements of one's own, from the docstring of dlkf.filters.sources to the letter."""
+"""A source of measurements of one's own, that of docs/developing.md; smoothed filters; factors on fixes."""
 
 import re
 import sys
 from dataclasses import replace
-from textwrap import dedent
 
 import pytest
 import torch
 
 from dlkf.base.errors import InputError
-from dlkf.filters import sources
 from dlkf.filters.advice import NetworkOutput
-from dlkf.filters.build import build_filter, is_filter, refuse_smoothed
+from dlkf.filters.build import FilterName, build_filter, is_filter, refuse_smoothed
 from dlkf.filters.gating import Gate
 from dlkf.filters.integration import integrate
 from dlkf.filters.smoother import SmoothedSolution
+from dlkf.running.likelihood import check_finds_noise
+from tests.docs.pages import ROOT, blocks
 
 from .scene import IMU, scene
-
-IMPORTS = """
-from dataclasses import dataclass
-import torch
-from dlkf.data.drive import Batch
-from dlkf.filters.integration import Epoch
-from dlkf.filters.sources import Predicted, Measurement
-from dlkf.filters.tuning import Tuning
-from dlkf.navigation.imu_errors import ImuSpec
-from dlkf.navigation.state import ErrorStates
-"""
 
 
 @pytest.fixture
 def on_path(tmp_path, monkeypatch):
-    example = sources.__doc__.split("::\n", 1)[1].split("\nand every command", 1)[0]
-    (tmp_path / "speed_limit.py").write_text(IMPORTS + dedent(example).replace("36.0", "10.0"))
+    (example,) = (block for block in blocks(ROOT / "docs" / "developing.md") if block.file == "speed_limit.py")
+    (tmp_path / "speed_limit.py").write_text(example.text)
     monkeypatch.syspath_prepend(str(tmp_path))
     yield
     sys.modules.pop("speed_limit", None)
@@ -86,8 +75,20 @@ def test_what_needs_a_causal_filter_refuses_a_smoothed_one_in_one_line():
 
     with pytest.raises(InputError, match="which a stream cannot"):
         StreamingFilter(build_filter("mbkf21_rts", IMU))
-    with pytest.raises(InputError, match="tune it without _rts"):
-        check_settings("mbkf21_rts", "log")
+    for name in ("mbkf21_rts", "mbkf21_rts+speed"):
+        with pytest.raises(InputError, match="tune it without _rts"):
+            check_settings(name, "log")
+
+
+def test_a_name_is_taken_apart_and_put_together():
+    for name in ("ins", "mbkf33_prior_gated+vibration_speed+receiver", "mbkf21_nhc+my_sources:SpeedLimit"):
+        assert str(FilterName.parse(name)) == name
+    prior = FilterName.parse("mbkf33_car_prior+vibration_speed")
+    assert prior.drop("prior") == "mbkf33_car+vibration_speed" == str(prior._replace(endings=("car",)))
+    assert FilterName.parse("mbkf21_nhc+speed").add(["speed", "baro"]) == "mbkf21_nhc+speed+baro"
+    assert FilterName.parse("mbkf21+speed").add(["baro"]) == "mbkf21+speed"  # knows no car
+    with pytest.raises(InputError, match="imu=auto finds the noise of a Kalman filter"):
+        check_finds_noise("mbkf15_prior+speed")
 
 
 class Advised:

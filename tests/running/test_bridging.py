@@ -8,13 +8,17 @@ import numpy as np
 import pytest
 import torch
 
+from dlkf.data.alignment import AlignConfig
+from dlkf.data.store import drive_from_tables
+from dlkf.filters.build import build_filter
 from dlkf.navigation.earth import tangent_frame
 from dlkf.navigation.state import ATTITUDE, POSITION, VELOCITY, NavState
 from dlkf.navigation.strapdown import strapdown
 from dlkf.running.bridging import LONGEST_BRIDGE_S, Stretch, bridge, can_bridge, fill_gap
 from dlkf.running.replay import replay_drive
+from dlkf.running.start import align_drives
 from dlkf.running.streaming import Status, StreamingFilter
-from tests.running.streams import ARM, EARTH, estimator, some
+from tests.running.streams import ARM, EARTH, IMU, estimator, some
 
 FILTERS = ("ins", "mbkf15", "mbkf21_car", "aekf", "plus", "net_run", "dlkf_kalman_mbkf21_car")
 
@@ -130,6 +134,20 @@ def test_what_is_longer_or_of_a_filter_without_a_rule_starts_over(drive):
     assert not can_bridge(Own())
     with pytest.raises(TypeError, match="no rule"):
         bridge(Own(), None, None)
+
+
+def test_a_second_of_samples_begins_anew_for_the_wheel_too(drive):
+    """Its vibration level is one of a second without a gap; with update intervals of 0.2 s it is kept between them."""
+    cut = drive_from_tables(drive, "", 50.0, 0.2, torch.float64)
+    batch = align_drives([cut], AlignConfig())
+    fresh = build_filter("mbkf21_nhc+speed", IMU).begin(batch)[0]
+    wheel, car = fresh.sources
+    level = car.liveliness._replace(second=car.liveliness.second._replace(means=torch.ones(1, 10, 6)))
+    shaken = wheel._replace(second=level.second, calmest=torch.ones(1)), car._replace(liveliness=level)
+    stretch = Stretch(batch.start, batch.start, torch.tensor([[0.1, 1.0, 0.1]], dtype=torch.float64), batch.frame)
+    wheel, car = bridge(fresh._replace(sources=shaken), stretch, fresh).sources
+    assert wheel.second.means.isnan().all() and car.liveliness.second.means.isnan().all()
+    assert wheel.calmest == 1
 
 
 def test_a_stamp_ahead_is_not_taken_for_a_gap(drive):

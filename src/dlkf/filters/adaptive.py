@@ -10,14 +10,11 @@ than an epoch, Q is what each epoch contributes. Between fixes and in an outage 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-
-from dlkf.filters.integration import Epoch
 
 SMALLEST_VARIANCE = 1e-6  # m², (m/s)²
 SETTLE_FIXES = 30  # the first corrections are of the start's errors and not of noise
@@ -31,47 +28,31 @@ class AdaptiveNoise(NamedTuple):
     settled: Tensor  # (B,) bool
     fixes: Tensor  # (B,) so far
     epochs: Tensor  # (B,) since the last fix
-    forgetting: Tensor  # (1,) share of the past, the same for all drives
+    forgetting: Tensor  # (1,) α, share of the past, the same for all drives
 
-
-@dataclass(frozen=True)
-class Adaptation:
-    """Recursive estimation of Q and R; ``forgetting`` α is the share of the past."""
-
-    forgetting: float
-
-    def begin(self, like: Tensor, states: int) -> AdaptiveNoise:
+    @classmethod
+    def begin(cls, like: Tensor, states: int, forgetting: float) -> AdaptiveNoise:
         """Nothing learned yet; ``like`` (B, …) gives batch and precision."""
         B, zeros = len(like), like.new_zeros
-        noise = zeros(B, states, states), zeros(B, 6), zeros(B) > 0
-        return AdaptiveNoise(*noise, zeros(B), zeros(B), like.new_tensor([self.forgetting]))
+        R, zero = zeros(B, 6), zeros(B)
+        return cls(zeros(B, states, states), R, zero > 0, zero, zero, like.new_tensor([forgetting]))
 
-    def learn_noise(
-        self,
-        noise: AdaptiveNoise,
-        epoch: Epoch,
-        used: Bool[Tensor, "B 6"],
-        H: Float[Tensor, "B 6 n"],
-        R: Float[Tensor, "B 6"],
-        updated: Float[Tensor, "B n n"],
-        dx: Float[Tensor, "B n"],
-        Q: Float[Tensor, "B n n"],
-    ) -> AdaptiveNoise:
-        """The noise after an epoch that ran with ``Q`` and ``R``; ``H`` has zero rows where nothing was used."""
-        epochs = noise.epochs + 1
+    def update(
+        self, z: Float[Tensor, "B 6"], used: Bool[Tensor, "B 6"], H: Float[Tensor, "B 6 n"], R: Float[Tensor, "B 6"],
+        P: Float[Tensor, "B n n"], dx: Float[Tensor, "B n"], Q: Float[Tensor, "B n n"],
+    ) -> AdaptiveNoise:  # fmt: skip
+        """After an update to P by dx, of a filter that ran with Q and R; ``H`` has zero rows where nothing was used."""
+        epochs = self.epochs + 1
         has_fix = used.any(-1)
-        fixes = noise.fixes + has_fix
+        fixes = self.fixes + has_fix
         learns = has_fix & (fixes > SETTLE_FIXES)
-        a = noise.forgetting
-        residual = epoch.z - (H @ dx.unsqueeze(-1)).squeeze(-1)
-        seen = residual.square() + (H @ updated @ H.mT).diagonal(dim1=-2, dim2=-1)
+        a = self.forgetting
+        residual = z - (H @ dx.unsqueeze(-1)).squeeze(-1)
+        seen = residual.square() + (H @ P @ H.mT).diagonal(dim1=-2, dim2=-1)
         adapted_R = (a * R + (1 - a) * seen).clamp_min(SMALLEST_VARIANCE)
         adapted_Q = a * Q + (1 - a) * (dx.unsqueeze(-1) * dx.unsqueeze(-2)) / epochs[:, None, None]
-        return AdaptiveNoise(
-            torch.where(learns[:, None, None], adapted_Q, Q),
-            torch.where(used & learns.unsqueeze(-1), adapted_R, R),
-            noise.settled | learns,
-            fixes,
-            torch.where(has_fix, 0.0, epochs),
-            a,
-        )
+        return self._replace(
+            Q=torch.where(learns[:, None, None], adapted_Q, Q),
+            R=torch.where(used & learns.unsqueeze(-1), adapted_R, R),
+            settled=self.settled | learns, fixes=fixes, epochs=torch.where(has_fix, 0.0, epochs),
+        )  # fmt: skip

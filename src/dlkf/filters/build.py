@@ -8,12 +8,11 @@ A sensor stands behind a plus, as in ``mbkf15+speed``, as do ``vibration_speed``
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Iterable, Mapping
+from typing import Any, NamedTuple
 
 from dlkf.base.classes import find_class
 from dlkf.base.errors import InputError
-from dlkf.filters.adaptive import Adaptation
 from dlkf.filters.aids.attach import SOURCES, add_sources
 from dlkf.filters.constraints import CarConstraints
 from dlkf.filters.integration import Estimator
@@ -37,12 +36,43 @@ OWN_SOURCE = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
 MODEL_BASED: tuple[str, ...] = ("ins", "mbkf15", "mbkf15_prior", "mbkf21", "mbkf33", "aekf")
 
 
+class FilterName(NamedTuple):
+    """``mbkf21_car_gated+speed``: base, endings, and what stands behind a plus."""
+
+    base: str
+    endings: tuple[str, ...]
+    own: tuple[str, ...]
+
+    @classmethod
+    def parse(cls, name: str) -> FilterName:
+        """Of any name."""
+        kind, *own = name.split("+")
+        base, *endings = kind.split("_")
+        return cls(base, tuple(endings), tuple(own))
+
+    def __str__(self) -> str:
+        return "+".join(("_".join((self.base, *self.endings)), *self.own))
+
+    def drop(self, ending: str) -> str:
+        """The name without an ending."""
+        return str(self._replace(endings=tuple(x for x in self.endings if x != ending)))
+
+    def add(self, aids: Iterable[str]) -> str:
+        """The name with these sensors behind a plus, of a filter with vehicle constraints; another unchanged."""
+        more = (aid for aid in aids if aid not in self.own) if self.knows_car else ()
+        return str(self._replace(own=(*self.own, *more)))
+
+    @property
+    def knows_car(self) -> bool:
+        """Whether the filter has vehicle constraints."""
+        return bool({"nhc", "car"} & set(self.endings))
+
+
 def is_filter(name: str) -> bool:
     """Whether a name is that of a model-based filter."""
-    name, *own = name.split("+")
-    base, *endings = name.split("_")
-    if name == "ins":
-        return not own
+    base, endings, own = FilterName.parse(name)
+    if base == "ins":
+        return not (endings or own)
     if not all(part in SOURCES or OWN_SOURCE.fullmatch(part) for part in own):
         return False
     return base in KALMAN and len(set(endings)) == len(endings) and set(endings) <= set(ENDINGS)
@@ -58,8 +88,7 @@ def build_filter(name: str, imu: ImuSpec, *, tuning: Tuning | None = None, prior
         raise InputError(f"unknown model {name!r}; known filters: {describe_filters()}")
     if name == "ins":
         return Ins()
-    kind, *own = name.split("+")
-    base, *endings = kind.split("_")
+    base, endings, own = parsed = FilterName.parse(name)
     states = ErrorStates(KALMAN[base], structure="car" in endings)
     if has_prior(name):
         if prior is None:
@@ -74,7 +103,7 @@ def build_filter(name: str, imu: ImuSpec, *, tuning: Tuning | None = None, prior
             )
     factors = tuning or Tuning()
     sources: list[Source] = []
-    if {"nhc", "car"} & set(endings):
+    if parsed.knows_car:
         sources.append(CarConstraints(factors, states))
     estimator = Mbkf(
         imu,
@@ -84,7 +113,7 @@ def build_filter(name: str, imu: ImuSpec, *, tuning: Tuning | None = None, prior
         gauss_markov="gm" in endings,
         gated="gated" in endings,
         sources=tuple(sources),
-        noise=Adaptation(factors.forgetting) if base == "aekf" else None,
+        adaptive=base == "aekf",
     )
     kinds = [SOURCES.get(part) or find_class(part, "source", ("begin", "rows")) for part in own]
     estimator = add_sources(estimator, kinds)
@@ -93,7 +122,7 @@ def build_filter(name: str, imu: ImuSpec, *, tuning: Tuning | None = None, prior
 
 def has_prior(name: str) -> bool:
     """Whether a filter of this name is given an IMU error before the drive."""
-    return "prior" in name.partition("+")[0].split("_")
+    return "prior" in FilterName.parse(name).endings
 
 
 def build_causal(name: str, imu: ImuSpec, why: str, **given: Any) -> Estimator:
@@ -106,8 +135,9 @@ def build_causal(name: str, imu: ImuSpec, why: str, **given: Any) -> Estimator:
 
 def refuse_smoothed(name: str, why: str) -> None:
     """InputError for the name of a filter that is to be smoothed."""
-    if "rts" in name.partition("+")[0].split("_"):
-        raise InputError(f"model {name} is smoothed: it looks ahead, {why}; take {name.replace('_rts', '')}")
+    parsed = FilterName.parse(name)
+    if "rts" in parsed.endings:
+        raise InputError(f"model {name} is smoothed: it looks ahead, {why}; take {parsed.drop('rts')}")
 
 
 def filter_names() -> list[str]:

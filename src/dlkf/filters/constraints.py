@@ -83,7 +83,7 @@ class CarConstraints:
         resting, liveliness = self.detect_rest(epoch, zr[:, 3:], prediction, memory)
         resting = resting.unsqueeze(-1)
         used = torch.cat(((moving.unsqueeze(-1) & ~resting).expand(-1, 2), resting.expand(-1, 6)), -1)
-        per_second = max(1.0, 1.0 / (epoch.dt * epoch.imu.shape[1]))
+        per_second = max(1.0, 1.0 / epoch.span_s)
         variance = (memory.std.square() * per_second).expand(len(zn), -1)
         if epoch.advice is not None and epoch.advice.across is not None:
             variance = torch.cat((variance[:, :2] * epoch.advice.across.square(), variance[:, 2:]), -1)

@@ -9,12 +9,23 @@ f̄ of an update interval, Φ has the columns of the gyroscopes' biases (ζ) tim
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import ClassVar
+
 from jaxtyping import Float
 from torch import Tensor
 
+from dlkf.filters.sources import Parameter, SensorSource
 from dlkf.navigation.state import GYRO, PVA, ErrorStates
 
 NAMES = tuple(f"g_sensitivity_{gyro}_{accel}" for gyro in "xyz" for accel in "xy")  # rad/s per m/s²
+
+
+class GSensitivity(SensorSource):
+    """``+g_sensitivity``: six entries of G, without rows of its own; fixes and constraints show G, as they show the
+    gyroscopes' biases."""
+
+    parameters: ClassVar[Mapping[str, Parameter]] = dict.fromkeys(NAMES, Parameter(std=1e-4, largest=2e-3))
 
 
 def has_g_sensitivity(states: ErrorStates) -> bool:

@@ -137,7 +137,7 @@ class CoarseGate:
         """The epoch without what is refused, and P, inflated where the gate recovers; it judges by the fix's own 1σ,
         not by the ``R`` that the filter takes it for."""
         with torch.no_grad():
-            span, variance = epoch.dt * epoch.imu.shape[1], P.diagonal(dim1=-2, dim2=-1)
+            span, variance = epoch.span_s, P.diagonal(dim1=-2, dim2=-1)
             grown = torch.cat((variance[:, :3] + span * span * variance[:, 3:6], variance[:, 3:6]), -1)
             memory = self._find_frozen(memory, epoch, grown)
         quiet = ~(memory.refused > 0) & ~memory.frozen
@@ -167,7 +167,7 @@ class CoarseGate:
         )
 
     def _judge(self, memory: CoarseMemory, epoch: Epoch, grown: Float[Tensor, "B 6"]) -> tuple[CoarseMemory, Verdict]:
-        z, used, span = epoch.z, epoch.used, epoch.dt * epoch.imu.shape[1]
+        z, used, span = epoch.z, epoch.used, epoch.span_s
         R, age = epoch.fix.std.square(), memory.age + span
         floor = torch.cat([torch.full_like(z[:, :3], x * x) for x in COARSE_FLOOR], -1)
         squares = torch.where(used, z.square() / (grown + R + floor), 0.0)
@@ -234,7 +234,7 @@ class Gate:
 
     def _judge(self, memory: GateMemory, epoch: Epoch, P: Tensor, R: Tensor) -> tuple[GateMemory, Tensor, Tensor]:
         """What passes (B, 6), and the variance that P is to have added."""
-        z, used, span = epoch.z, epoch.used, epoch.dt * epoch.imu.shape[1]
+        z, used, span = epoch.z, epoch.used, epoch.span_s
         position = used[:, :3].any(-1)
         same = (epoch.fix.value[:, :3] == memory.fix).all(-1) & position
         frozen = same & (memory.frozen | (epoch.window.end.v_n.norm(dim=-1) > FROZEN_SPEED))
@@ -291,7 +291,7 @@ def average_by_part(x: Float[Tensor, "B 6"]) -> Float[Tensor, "B 4"]:
 def _predicted_variance(epoch: Epoch, P: Float[Tensor, "B n n"]) -> Float[Tensor, "B 6"]:
     """Variance of position and velocity at the end of the window, of P at its start: to first order, correlations left
     out. Acceleration is unknown by what tilt makes of gravity, heading of the horizontal force, and by its bias."""
-    span, variance = epoch.dt * epoch.imu.shape[1], P.diagonal(dim1=-2, dim2=-1)
+    span, variance = epoch.span_s, P.diagonal(dim1=-2, dim2=-1)
     force = epoch.corrected[..., :2].mean(1).square().sum(-1)
     tilt, heading = variance[:, ATTITUDE][:, :2].amax(-1), variance[:, ATTITUDE][:, 2]
     acceleration = STANDARD_GRAVITY**2 * tilt + force * heading + variance[:, ACCEL].amax(-1)

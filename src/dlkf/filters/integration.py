@@ -62,6 +62,11 @@ class Epoch(NamedTuple):
         """(B, 6) bool: components of the fix that may be used."""
         return self.fix.used
 
+    @property
+    def span_s(self) -> float:
+        """Length of the window [s]."""
+        return self.dt * self.imu.shape[1]
+
 
 class Covariances(NamedTuple):
     """Covariances of a Kalman filter in an epoch: for smoothing and for tests of consistency."""

@@ -138,7 +138,7 @@ class LearnedFilter(nn.Module):
     def step(self, memory: LearnedMemory, epoch: Epoch) -> tuple[LearnedMemory, Correction]:
         """Run the network for the segments that have a fix (``hold``) or for all (``run``)."""
         B = len(epoch.z)
-        span = epoch.dt * epoch.imu.shape[1]
+        span = epoch.span_s
         has_fix = epoch.used.any(-1)
         memory = memory._replace(elapsed=memory.elapsed + span, since_fix=memory.since_fix + span)
         hold = self.config.outage_mode == "hold"

@@ -113,17 +113,17 @@ class LearnedKalmanFilter(LearnedFilter):
 
     def step(self, memory: LearnedKalmanMemory, epoch: Epoch) -> tuple[LearnedKalmanMemory, Correction]:  # type: ignore[override]
         """The Kalman filter's update with what the network adds."""
-        span = epoch.dt * epoch.imu.shape[1]
-        kalman = self.kalman.advance_delay(memory.kalman, span)
-        offered = self.kalman.predict_fix(kalman, epoch)
-        kalman, epoch = self.kalman.screen_fix(kalman, offered)
+        span = epoch.span_s
+        kalman, offered = self.kalman.predict_fix(memory.kalman, epoch)
+        before, epoch = self.kalman.screen_fix(kalman, offered)
         fixed = epoch.used.any(-1)
         network = memory.network
         network = network._replace(elapsed=network.elapsed + span, since_fix=network.since_fix + span)
         with torch.no_grad():
-            further = self._kalman_inputs(kalman.P, epoch)
+            further = self._kalman_inputs(before.P, epoch)
         gain, added, recurrent = self._run(network, epoch, torch.arange(len(fixed)), True, fixed, further)
-        kalman, correction = self.kalman.update(kalman, epoch._replace(error=memory.estimate))
+        kalman, correction = self.kalman.update(before, epoch._replace(error=memory.estimate))
+        rejected = self.kalman.find_rejected(before, offered, epoch, correction)
         estimate = ImuError.of(correction.imu_error)
         part = self._limit_turn(torch.bmm(gain, epoch.z.unsqueeze(-1)).squeeze(-1))
         dx = correction.dx + part
@@ -137,7 +137,7 @@ class LearnedKalmanFilter(LearnedFilter):
         whole = torch.cat((dx, covariances.dx[:, PVA.stop :]), -1)
         return LearnedKalmanMemory(network, kalman._replace(P=P), estimate), correction._replace(
             dx=dx, imu_error=_add_errors(estimate, added), std=std, gain=total, innovation=offered.z,
-            covariances=covariances._replace(updated=P, dx=whole),
+            rejected=rejected, covariances=covariances._replace(updated=P, dx=whole),
         )  # fmt: skip
 
     def _kalman_inputs(self, P: Float[Tensor, "B n n"], epoch: Epoch) -> Float[Tensor, "B K"]:
@@ -153,9 +153,8 @@ class LearnedKalmanFilter(LearnedFilter):
 
 def _add_gain(P: Float[Tensor, "B n n"], gain: Float[Tensor, "B 9 6"], c: Covariances) -> Float[Tensor, "B n n"]:
     """Covariance after an optimal update with a further gain on the fix: P + E S Eᵀ."""
-    S = torch.bmm(torch.bmm(c.H, c.predicted), c.H.mT) + torch.diag_embed(c.R)
     P = P.clone()
-    P[:, PVA, PVA] += torch.bmm(torch.bmm(gain, S), gain.mT)
+    P[:, PVA, PVA] += gain @ c.innovation @ gain.mT
     return P
 
 

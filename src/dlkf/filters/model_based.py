@@ -12,25 +12,17 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dlkf.data.drive import Batch
-from dlkf.filters.adaptive import Adaptation, AdaptiveNoise
+from dlkf.filters.adaptive import AdaptiveNoise
 from dlkf.filters.branches import may_branch
 from dlkf.filters.constraints import STRUCTURE_STD, STRUCTURE_WALK_STD
 from dlkf.filters.g_sensitivity import add_columns, has_g_sensitivity, select_matrix
 from dlkf.filters.gating import CoarseGate, Gate
+from dlkf.filters.gnss_fix import FixMemory, GnssFix
 from dlkf.filters.heavy_tails import HeavyTails
 from dlkf.filters.integration import Correction, Covariances, Epoch, Estimator
 from dlkf.filters.kalman_update import kalman_prediction, kalman_update
 from dlkf.filters.receiver import add_drift, has_receiver, let_delay_grow, predict_fix, widen_start
-from dlkf.filters.sources import (
-    FixMemory,
-    GnssFix,
-    Measurement,
-    Parameter,
-    Predicted,
-    Source,
-    describe_aid,
-    predicted_variance,
-)
+from dlkf.filters.sources import Measurement, Parameter, Predicted, Source, describe_aid, predicted_variance
 from dlkf.filters.tuning import Prior, Tuning
 from dlkf.navigation.calibration import ImuError
 from dlkf.navigation.earth import STANDARD_GRAVITY
@@ -95,7 +87,7 @@ class Mbkf:
     initial knowledge of the IMU: with a training set's mean error these are ``mbkf15_prior``, ``mbkf33_prior``
     (paper.md 4.6).
     ``gauss_markov`` lets the biases decay with the preset's correlation time instead of walking. ``gated`` refuses
-    outliers among the fixes, ``sources`` gives further measurements, ``noise`` adapts Q and R to the innovations.
+    outliers among the fixes, ``sources`` gives further measurements, ``adaptive``: Q and R follow the innovations.
     """
 
     imu: ImuSpec
@@ -105,7 +97,7 @@ class Mbkf:
     gauss_markov: bool = False
     gated: bool = False
     sources: tuple[Source, ...] = ()
-    noise: Adaptation | None = None
+    adaptive: bool = False
     cut_transition: bool = False  # no gradient through Φ, which makes training faster
     heavy_tails: bool = False  # of the prior of the vertical gyroscope's scale factor, where it is a state
 
@@ -119,7 +111,6 @@ class Mbkf:
         """The filter without its numeric settings, which its memory carries: two of one code do the same."""
         return replace(
             self, imu=GENERIC_IMU, tuning=Tuning(), prior=None, gauss_markov=False,
-            noise=self.noise and Adaptation(0.5),
             sources=tuple(getattr(s, "code", s) for s in self.sources),
         )  # fmt: skip
 
@@ -147,7 +138,9 @@ class Mbkf:
             walk=torch.tensor(walk) ** 2 if walk else None,
         )  # fmt: skip
         sources = tuple(source.begin(batch) for source in self.sources)
-        noise = None if self.noise is None else self.noise.begin(batch.imu, self.states.count)
+        noise = None
+        if self.adaptive:
+            noise = AdaptiveNoise.begin(batch.imu, self.states.count, self.tuning.forgetting)
         error = ImuError(torch.zeros(B, 6, **like))
         if self.prior is not None:
             mean = torch.tensor(self.prior.mean, **like).expand(B, -1)
@@ -183,8 +176,7 @@ class Mbkf:
 
     def step(self, memory: KalmanMemory, epoch: Epoch) -> tuple[KalmanMemory, Correction]:
         """:meth:`update` with what the gate leaves of the fix."""
-        memory = self.advance_delay(memory, epoch.dt * epoch.imu.shape[1])
-        epoch = self.predict_fix(memory, epoch)
+        memory, epoch = self.predict_fix(memory, epoch)
         memory, screened = self.screen_fix(memory, epoch)
         after, correction = self.update(memory, screened)
         rejected = self.find_rejected(memory, epoch, screened, correction)
@@ -202,18 +194,15 @@ class Mbkf:
             H, R = self.fix.matrix(offered), self.fix.variance(offered, memory.fix, memory.noise)
             return torch.where(rejected, predicted_variance(c.predicted, H) + R, 0.0)
 
-    def advance_delay(self, memory: KalmanMemory, seconds: float) -> KalmanMemory:
-        """At the end of an update interval, as far as the fix is concerned: its delay has grown."""
+    def predict_fix(self, memory: KalmanMemory, epoch: Epoch) -> tuple[KalmanMemory, Epoch]:
+        """At the end of an update interval: the delay of the fixes has grown, and the innovation is that which delay
+        and antenna give, where the filter estimates them."""
         if memory.parameters is None or not has_receiver(self.states):
-            return memory
+            return memory, epoch
+        seconds = epoch.span_s
         P, parameters = let_delay_grow(memory.P, memory.parameters, self.states, seconds)
-        return memory._replace(P=P, parameters=parameters)
-
-    def predict_fix(self, memory: KalmanMemory, epoch: Epoch) -> Epoch:
-        """The epoch with the innovation that delay and antenna give, where the filter estimates them."""
-        if memory.parameters is None or not has_receiver(self.states):
-            return epoch
-        return predict_fix(epoch, self._name_parameters(memory))
+        memory = memory._replace(P=P, parameters=parameters)
+        return memory, predict_fix(epoch, self._name_parameters(parameters))
 
     def screen_fix(self, memory: KalmanMemory, epoch: Epoch) -> tuple[KalmanMemory, Epoch]:
         """Memory and epoch after the gate of its fixes."""
@@ -230,10 +219,9 @@ class Mbkf:
         if memory.noise is not None:
             Q = torch.where(memory.noise.settled[:, None, None], memory.noise.Q, Q)
         predicted = kalman_prediction(memory.P, Phi, Q, walking=not self.gauss_markov)
-        prediction = Predicted(predicted, memory.structure, memory.noise)
+        named = {} if memory.parameters is None else self._name_parameters(memory.parameters)
+        prediction = Predicted(predicted, memory.structure, named)
         fix = self.fix.rows(epoch, memory.fix, memory.noise)
-        if memory.parameters is not None:
-            prediction = prediction._replace(parameters=self._name_parameters(memory))
         parts, sources, said = [fix], [], []
         for source, of_source in zip(self.sources, memory.sources, strict=True):
             rows, of_source = source.rows(epoch, of_source, prediction)
@@ -258,9 +246,9 @@ class Mbkf:
         if tails is not None:
             tails, P, dx = tails.update(P, dx, epoch.error, self.states, epoch.used.any(-1))
         noise = memory.noise
-        if self.noise is not None and noise is not None:
-            variance = self.fix.variance(epoch, memory.fix, memory.noise)
-            noise = self.noise.learn_noise(noise, epoch, fix.used, H[:, :6], variance, P, dx, Q)
+        if noise is not None:
+            R = self.fix.variance(epoch, memory.fix, noise)
+            noise = noise.update(epoch.z, fix.used, fix.H, R, P, dx, Q)
         structure = memory.structure
         if structure is not None:
             structure = structure + dx[:, self.states.of_structure]
@@ -274,7 +262,7 @@ class Mbkf:
                 parameters = torch.maximum(torch.minimum(parameters, most), -most)
             said += [parameters, P.diagonal(dim1=-2, dim2=-1)[:, self.states.of_others].clamp_min(0).sqrt()]
         if has_receiver(self.states):
-            Phi = add_drift(Phi, self.states, epoch.dt * epoch.imu.shape[1])
+            Phi = add_drift(Phi, self.states, epoch.span_s)
         memory = KalmanMemory(P, memory.windows, memory.fix, tuple(sources), structure, noise, parameters, tails)
         error = epoch.error.update(dx, self.states)
         if parameters is not None and has_g_sensitivity(self.states):
@@ -285,10 +273,9 @@ class Mbkf:
             aids=torch.cat(said, -1) if said else None,
         )  # fmt: skip
 
-    def _name_parameters(self, memory: KalmanMemory) -> dict[str, Tensor]:
+    def _name_parameters(self, parameters: Float[Tensor, "B k"]) -> dict[str, Tensor]:
         """Estimates (B,) of the sources' parameters."""
-        assert memory.parameters is not None
-        return dict(zip(self.states.others, memory.parameters.unbind(-1)))
+        return dict(zip(self.states.others, parameters.unbind(-1)))
 
     def _transition(self, memory: KalmanMemory, epoch: Epoch) -> Float[Tensor, "B n n"]:
         if not (self.cut_transition and torch.is_grad_enabled()):

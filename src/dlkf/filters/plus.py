@@ -111,7 +111,6 @@ class PlusMemory(NamedTuple):
     outage: VirtualOutage  # how much white noise there is
     errors: PositionErrors  # of the fixes
     fix_noise: FixNoise  # of those that claim too little
-    gyro_noise: Tensor | None = None  # (B, 3) the last factors, for pictures
 
 
 class PlusFilter(nn.Module):
@@ -180,11 +179,10 @@ class PlusFilter(nn.Module):
 
     def step(self, memory: PlusMemory, epoch: Epoch) -> tuple[PlusMemory, Correction]:
         """Network, the Kalman filter with the noise of both, then the virtual outage beside it."""
-        span = epoch.dt * epoch.imu.shape[1]
-        memory = memory._replace(kalman=self.kalman.advance_delay(memory.kalman, span))
-        claimed = self.kalman.predict_fix(memory.kalman, epoch)
+        span = epoch.span_s
+        kalman, claimed = self.kalman.predict_fix(memory.kalman, epoch)
         offered = memory.fix_noise.inflate_fix(claimed)
-        kalman, epoch = self.kalman.screen_fix(memory.kalman, offered)
+        kalman, epoch = self.kalman.screen_fix(kalman, offered)
         walk = torch.diag_embed(memory.errors.variance(offered))
         outage = memory.outage._replace(P=_add_walk(memory.outage.P, walk))
         memory = memory._replace(kalman=kalman._replace(P=_add_walk(kalman.P, walk)), outage=outage)
@@ -230,7 +228,7 @@ class PlusFilter(nn.Module):
         correction = correction._replace(innovation=claimed.z, rejected=rejected)
         return memory._replace(
             kalman=kalman, hidden=hidden, matching=matching, outage=outage, errors=errors, fix_noise=fix_noise,
-            gyro_noise=gyro_noise, fix_speed=torch.where(fixed, forward, memory.fix_speed),
+            fix_speed=torch.where(fixed, forward, memory.fix_speed),
         ), correction  # fmt: skip
 
     def _normalise_innovation(self, memory: PlusMemory, epoch: Epoch) -> Float[Tensor, "B 6"]:

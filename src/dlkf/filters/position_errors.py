@@ -70,14 +70,14 @@ class PositionErrors(NamedTuple):
 
     def variance(self, epoch: Epoch) -> Float[Tensor, "B 3"]:
         """By which the errors of the positions have moved in this update interval [m²]; zero without a fix."""
-        largest = (1 - self.white_share.clamp_max(1.0)) * _largest_walk(epoch.dt * epoch.imu.shape[1])
+        largest = (1 - self.white_share.clamp_max(1.0)) * _largest_walk(epoch.span_s)
         std = torch.where(epoch.used[:, POSITION], epoch.fix.std[:, POSITION], 0.0)
         return torch.minimum(self.walk.clamp_min(0.0), largest)[:, PART] * std.square()
 
     def noise(self, epoch: Epoch, position_std: Float[Tensor, ""]) -> Float[Tensor, "B 4"]:
         """Factors on the 1σ of position, horizontal and down, and of velocity (1), of a filter that takes positions
         for ``position_std`` times as noisy as claimed."""
-        intervals = NOISE_S / (epoch.dt * epoch.imu.shape[1])
+        intervals = NOISE_S / epoch.span_s
         slow = self.white_share + 0.5 * intervals * self.walk.clamp_min(0.0)
         factor = torch.maximum(slow, 0.5 * self.recent).clamp_min(1e-6).sqrt()
         least = LEAST_STD / (position_std * epoch.fix.std[:, [0, 2]]).clamp_min(LEAST_STD)
@@ -99,7 +99,7 @@ class PositionErrors(NamedTuple):
         change = change * (LARGEST / size.clamp_min(LARGEST))[:, PART]
         successive = torch.where(torch.stack((used[:, :2].all(-1), used[:, 2]), -1), self.successive + 1, 0.0)
         square, product = (_parts(change * x) for x in (change, self.change))
-        span = epoch.dt * epoch.imu.shape[1]
+        span = epoch.span_s
         of_velocity = c.predicted.diagonal(dim1=-2, dim2=-1)[:, VELOCITY] * (span / std).square()
         fixes = (self.fixes + 1).clamp_max(MEMORY)
         white = self.white - (product + self.white) / fixes

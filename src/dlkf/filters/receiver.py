@@ -7,18 +7,20 @@ the filter's own error, which is in the innovation too), C and C [ω×] for δl,
 λ + d for the age of the fix. a is the change of velocity over ``SLOPE_S`` to either side, inside
 the window: a mean over all of it lags when the car turns, and the delay seems too certain. A
 receiver's clock that is fast by r against that of the IMU makes the delay grow, ḋ = r (:func:`let_delay_grow`). A
-filter with the source ``+receiver`` (:class:`dlkf.filters.aids.receiver.Receiver`) estimates d, δl and r.
+filter with the source ``+receiver`` (:class:`Receiver`) estimates d, δl and r.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from dlkf.filters.integration import Epoch, rate_before
+from dlkf.filters.sources import Parameter, SensorSource
 from dlkf.navigation.attitude import skew
 from dlkf.navigation.error_model import ARM_RATE_S, antenna
 from dlkf.navigation.state import POSITION, ErrorStates, NavState
@@ -29,6 +31,16 @@ DRIFT = "clock_drift_ppm"
 PPM = 1e-6
 MOVING = 1.0  # m/s: a slower car shows no delay
 SLOPE_S = 0.2  # s to either side of a fix, over which the acceleration is a mean
+
+
+class Receiver(SensorSource):
+    """Delay of the fixes, antenna and clock; it has no rows of its own, those of the fix contain them."""
+
+    parameters: ClassVar[Mapping[str, Parameter]] = {
+        DELAY: Parameter(std=0.05, walk=1e-4, largest=0.9),
+        **{name: Parameter(std=0.2, largest=2.0) for name in ARM},
+        DRIFT: Parameter(std=100.0, walk=0.1, largest=1000.0),
+    }
 
 
 def has_receiver(states: ErrorStates) -> bool:

@@ -132,7 +132,7 @@ class PositionSpan(NamedTuple):
         """After a window, ``fixed`` by a position that counts; and the levels of a stationary and of a moving second
         that the span shows, inf: none."""
         infinite = torch.full_like(level, math.inf)
-        age = self.age_s + epoch.dt * epoch.imu.shape[1]
+        age = self.age_s + epoch.span_s
         least = torch.minimum(self.moving, torch.where(moves, level, infinite))
         least_still = torch.minimum(self.still, torch.where(still, level, infinite))
         place = epoch.at_fix.p_n[:, :2] + epoch.z[:, :2]
@@ -227,7 +227,7 @@ def detect_stationary(
     second, level, mean = before.second.update(epoch.corrected, epoch.dt)
     if level is None:
         return torch.zeros_like(before.standing) > 0, before
-    span = epoch.dt * epoch.imu.shape[1]
+    span = epoch.span_s
     v, diagonal = epoch.window.end.v_n, P.diagonal(dim1=-2, dim2=-1)
     speed, std = v[:, :2].norm(dim=-1), diagonal[:, VELOCITY][:, :2].sum(-1).sqrt()
     gained, turn = (v - epoch.start.v_n)[:, :2].norm(dim=-1) / span, turning.norm(dim=-1)

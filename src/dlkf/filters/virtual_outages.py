@@ -87,14 +87,14 @@ class VirtualOutage(NamedTuple):
         L = Phi[:, PVA, ATTITUDE]
         plain = (L @ L.mT) * windows.spread[1, PVA, PVA]
         white = F @ self.white @ F.mT + torch.cat((by_source[:, :2, PVA, PVA], plain.unsqueeze(1)), 1)
-        age = self.age + epoch.dt * epoch.imu.shape[1]
+        age = self.age + epoch.span_s
 
         fixed = epoch.used[:, :2].all(-1)
         scored = fixed & (age >= self.due) & (age < STALE_S)
         gained = torch.zeros_like(self.evidence)
         if not may_branch(scored) or bool(scored.any()):
             gained = select_branch(scored, _log_evidence(epoch, c, drift, P, white), gained)
-        kept = 1 - fixed.to(age.dtype) * (epoch.dt * epoch.imu.shape[1] / MEMORY_S)
+        kept = 1 - fixed.to(age.dtype) * (epoch.span_s / MEMORY_S)
         evidence = kept[:, None, None, None] * self.evidence + gained
 
         over = fixed & ((scored & (self.due >= LAST_S)) | (age >= STALE_S))

@@ -52,8 +52,8 @@ class ImuError(NamedTuple):
             return self._replace(bias=bias)
         if states.matrix == "scale":
             change = dx[:, states.of_matrix]
-            return self._replace(bias=bias, matrix=change if self.matrix is None else self.matrix + change)
-        change = torch.index_select(dx, 1, _index_by_rows(states, dx.device)).unflatten(-1, (2, 3, 3))
+        else:
+            change = torch.index_select(dx, 1, _index_by_rows(states, dx.device)).unflatten(-1, (2, 3, 3))
         return self._replace(bias=bias, matrix=change if self.matrix is None else self.matrix + change)
 
     def elements(self, states: ErrorStates) -> Float[Tensor, "*b k"]:

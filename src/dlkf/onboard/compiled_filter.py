@@ -46,8 +46,9 @@ from dlkf.onboard.functions import (
 )
 from dlkf.onboard.library import FLAGS, Library, build, describe_machine, find_compiler, require_compiler
 from dlkf.onboard.library_cache import find_cache, load_cached
-from dlkf.running.bridging import Stretch, bridge, find_covariance
-from dlkf.running.reanchoring import FrameChange, can_reanchor, reanchor
+from dlkf.running import bridging, reanchoring
+from dlkf.running.bridging import Stretch, find_covariance
+from dlkf.running.reanchoring import FrameChange, can_reanchor
 
 MANY = 16  # drives from which on torch is faster than C where a network is large: measured with dlkf at 1 and 64
 LARGE = 1_000_000  # weights: more than the cache of a core holds
@@ -60,12 +61,14 @@ class Vector(NamedTuple):
     numbers: Tensor  # (B, K)
     filter: CompiledFilter
 
+    @property
+    def P(self) -> Tensor | None:
+        """Covariance of the error states, where the filter has one."""
+        return find_covariance(self.filter.layout.unpack(self.numbers).memory)
 
-class FixedVector(NamedTuple):
+
+class FixedVector(Vector):
     """The same of a filter whose memory cannot go to another tangent frame."""
-
-    numbers: Tensor
-    filter: CompiledFilter
 
 
 class CompiledFilter(WholeLoop):
@@ -87,7 +90,7 @@ class CompiledFilter(WholeLoop):
             raise AttributeError(name)
         return getattr(self.estimator, name)
 
-    def begin(self, batch: Batch) -> tuple[Vector | FixedVector, Tensor | ImuError]:
+    def begin(self, batch: Batch) -> tuple[Vector, Tensor | ImuError]:
         """That of the filter, packed. InputError for data on another grid."""
         if batch.size[2] != self.grid.samples or abs(batch.dt - self.grid.dt) > 1e-9 * self.grid.dt:
             raise InputError(
@@ -103,7 +106,7 @@ class CompiledFilter(WholeLoop):
         """Not of an epoch's end alone: :meth:`advance`."""
         raise NotImplementedError
 
-    def advance(self, memory: Vector | FixedVector, imu: Tensor, fix: Fix, frame: TangentFrame) -> tuple[Any, Step]:
+    def advance(self, memory: Vector, imu: Tensor, fix: Fix, frame: TangentFrame) -> tuple[Any, Step]:
         """One epoch of one drive."""
         vector, outputs = self.library.turn(memory.numbers, imu.contiguous(), pack_fix(fix, self._aids))
         x = split_outputs(outputs)
@@ -205,25 +208,21 @@ def count_shared_epochs(
     return first, common
 
 
-@reanchor.register
-def _(memory: Vector, change: FrameChange, fresh: Vector) -> Vector:
-    """The whole memory."""
+def _reanchor(change: FrameChange, memory: Vector, fresh: Vector) -> Vector:
+    """The whole memory in another tangent frame."""
     f = memory.filter
     x = move_anchor(f.estimator, f.layout.unpack(memory.numbers), f.grid, change)
     return memory._replace(numbers=f.layout.pack(x))
 
 
-@bridge.register
-def _(memory: Vector, stretch: Stretch, fresh: Vector) -> Vector:
-    """The whole memory."""
+def _bridge(stretch: Stretch, memory: Vector, fresh: Vector) -> Vector:
+    """The whole memory after a gap."""
     f = memory.filter
     x = cross_gap(f.estimator, f.layout.unpack(memory.numbers), stretch.end, stretch.seconds, f.grid)
     return memory._replace(numbers=f.layout.pack(x))
 
 
-@find_covariance.register
-def _(memory: Vector) -> Tensor | None:
-    return find_covariance(memory.filter.layout.unpack(memory.numbers).memory)
+reanchoring.RULES[Vector], bridging.RULES[Vector] = _reanchor, _bridge
 
 
 def compile_filter(estimator: Filter, rate_hz: float, epoch_s: float, whole: bool = False) -> CompiledFilter:

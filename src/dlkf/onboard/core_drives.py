@@ -19,9 +19,8 @@ from dlkf.onboard.compiled_filter import CompiledFilter
 from dlkf.onboard.core import Core, Status
 from dlkf.onboard.library import Library
 from dlkf.running.offline import Navigated
-from dlkf.running.replay import UnalignedError, replay_drive, stream_drive
+from dlkf.running.replay import find_why_unaligned, replay_drive, stream_drive
 from dlkf.running.solution import COLUMNS
-from dlkf.running.start import align as find_start
 
 
 def runs_in_core(align: AlignConfig) -> bool:
@@ -56,11 +55,7 @@ def run_core_drive(
         if core.count(Status.LOST) > len(lost):
             lost.append(core.latest)
     if not found:
-        try:
-            find_start(drive, replace(align, from_rest=False))
-        except InputError as error:
-            raise UnalignedError(str(error)) from None
-        raise UnalignedError(f"drive {name}: ends before a filter could start")
+        raise find_why_unaligned(drive, name, replace(align, from_rest=False))
     rows = np.stack([found[t] for t in sorted(found)])
     table = pd.DataFrame(rows, columns=list(list_columns(estimator)))
     table = table[[*COLUMNS, "gnss_used", *aid_columns(estimator)]].astype({"gnss_used": bool})

@@ -156,7 +156,6 @@ MEMORY = {  # by the last parts of a field's name
     "fix_noise.successive": "fixes in successive epochs, by part of a fix",
     "fix_noise.variance": "variance of the noise of fixes over the claimed one (of positions with 0.1 m more), by part",
     "fix_noise.fixes": "fixes that it counts for",
-    "memory.gyro_noise": "the network's last factors on the gyroscopes' noise; forward, right, down",
 }
 
 

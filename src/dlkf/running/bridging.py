@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property, singledispatch
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -23,12 +23,17 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dlkf.filters import constraints, learned, learned_kalman, model_based, plus
+from dlkf.filters.learned import LearnedMemory
+from dlkf.filters.learned_kalman import LearnedKalmanMemory
+from dlkf.filters.model_based import KalmanMemory
+from dlkf.filters.plus import PlusMemory
+from dlkf.filters.stationarity import LastSecond, PositionSpan
 from dlkf.filters.vibration_speed import VibrationMemory
 from dlkf.filters.virtual_outages import VirtualOutage
 from dlkf.navigation.attitude import skew
 from dlkf.navigation.earth import TangentFrame
 from dlkf.navigation.state import ATTITUDE, POSITION, STATES, VELOCITY, NavState
+from dlkf.running.memory_rules import ANEW, Rules, begin_anew, change_memory
 
 LONGEST_BRIDGE_S = 3.0  # s, gaps of the IMU
 LINE = (True, True, False, False, False, True)  # columns of a sample that go on the line across a gap
@@ -91,6 +96,14 @@ class Stretch:
         P = Phi @ P @ Phi.mT
         return 0.5 * (P + P.mT)
 
+    def state(self, before: NavState) -> NavState:
+        """The state at its end."""
+        return self.end
+
+    def time(self, before: Float[Tensor, " B"]) -> Float[Tensor, " B"]:
+        """A time [s] at its end."""
+        return before + self.seconds.sum(-1).to(before.dtype)
+
 
 def fill_gap(before: np.ndarray, after: np.ndarray, usual: np.ndarray, count: int) -> np.ndarray:
     """``count`` samples (count, 6) between the last samples ``before`` a gap (k, 6) and the first ``after`` it.
@@ -102,18 +115,39 @@ def fill_gap(before: np.ndarray, after: np.ndarray, usual: np.ndarray, count: in
     return np.where(LINE, line, usual)
 
 
-@singledispatch
+def _bridge_plus(stretch: Stretch, memory: PlusMemory, fresh: PlusMemory) -> PlusMemory:
+    """With a new virtual outage, and without the residuals of the last fixes; what is known of noise stays."""
+    kalman = bridge(memory.kalman, stretch, fresh.kalman)
+    return memory._replace(
+        kalman=kalman, elapsed=stretch.time(memory.elapsed), since_fix=stretch.time(memory.since_fix),
+        outage=VirtualOutage.begin(kalman.P)._replace(evidence=memory.outage.evidence),
+        errors=memory.errors._replace(residual=fresh.errors.residual, successive=fresh.errors.successive),
+        fix_noise=memory.fix_noise._replace(successive=fresh.fix_noise.successive),
+    )  # fmt: skip
+
+
+RULES: Rules = {
+    KalmanMemory: {"P": Stretch.covariance},
+    PositionSpan: begin_anew,
+    LastSecond: begin_anew,
+    VibrationMemory: {"block": ANEW, "last_sample": ANEW, "age": Stretch.time},
+    LearnedMemory: {"posterior": Stretch.state, "elapsed": Stretch.time, "since_fix": Stretch.time},
+    LearnedKalmanMemory: {},
+    PlusMemory: _bridge_plus,
+}
+
+
 def bridge(memory: Any, stretch: Stretch, fresh: Any) -> Any:
     """A filter's memory at the end of a stretch; ``fresh`` is what its ``begin`` gives there.
 
     TypeError for a memory of which it is not known here what a gap changes (:func:`can_bridge`).
     """
-    raise TypeError(f"no rule for a memory of type {type(memory).__name__}")
+    return change_memory(RULES, stretch, memory, fresh)
 
 
 def can_bridge(memory: Any) -> bool:
     """Whether a filter goes on after a gap of the IMU; one that cannot starts over."""
-    return bridge.dispatch(type(memory)) is not bridge.dispatch(object)
+    return memory is None or type(memory) in RULES
 
 
 def bridge_std(std: Float[Tensor, "B 15"], before: Any, after: Any) -> Float[Tensor, "B 15"]:
@@ -125,63 +159,6 @@ def bridge_std(std: Float[Tensor, "B 15"], before: Any, after: Any) -> Float[Ten
     return (std.square() + added).clamp_min(0).sqrt()
 
 
-@singledispatch
 def find_covariance(memory: Any) -> Float[Tensor, "B n n"] | None:
     """Of the error states of a Kalman filter, or one with a network round it; None without."""
     return getattr(getattr(memory, "kalman", memory), "P", None)
-
-
-@bridge.register
-def _(memory: None, stretch: Stretch, fresh: None) -> None:
-    return None
-
-
-@bridge.register
-def _(memory: model_based.KalmanMemory, stretch: Stretch, fresh: model_based.KalmanMemory) -> model_based.KalmanMemory:
-    sources = tuple(
-        bridge(old, stretch, new) if can_bridge(old) else old for old, new in zip(memory.sources, fresh.sources)
-    )
-    return memory._replace(P=stretch.covariance(memory.P), sources=sources)
-
-
-@bridge.register
-def _(memory: constraints.CarMemory, stretch: Stretch, fresh: constraints.CarMemory) -> constraints.CarMemory:
-    """Without the last second of samples and the place of the last fix."""
-    of_fresh = fresh.liveliness
-    return memory._replace(liveliness=memory.liveliness._replace(span=of_fresh.span, second=of_fresh.second))
-
-
-@bridge.register
-def _(memory: VibrationMemory, stretch: Stretch, fresh: VibrationMemory) -> VibrationMemory:
-    """Without the block that the gap falls into."""
-    age = memory.age + stretch.seconds.sum(-1).to(memory.age.dtype)
-    return memory._replace(block=fresh.block, last_sample=fresh.last_sample, age=age)
-
-
-@bridge.register
-def _(memory: learned.LearnedMemory, stretch: Stretch, fresh: learned.LearnedMemory) -> learned.LearnedMemory:
-    """The filter's memory of states and times; the network's stays."""
-    span = stretch.seconds.sum(-1).to(memory.elapsed.dtype)
-    return memory._replace(posterior=stretch.end, elapsed=memory.elapsed + span, since_fix=memory.since_fix + span)
-
-
-@bridge.register
-def _(
-    memory: learned_kalman.LearnedKalmanMemory, stretch: Stretch, fresh: learned_kalman.LearnedKalmanMemory
-) -> learned_kalman.LearnedKalmanMemory:
-    network = bridge(memory.network, stretch, fresh.network)
-    return memory._replace(network=network, kalman=bridge(memory.kalman, stretch, fresh.kalman))
-
-
-@bridge.register
-def _(memory: plus.PlusMemory, stretch: Stretch, fresh: plus.PlusMemory) -> plus.PlusMemory:
-    """With a new virtual outage, and without the residuals of the last fixes; what is known of noise stays."""
-    kalman = bridge(memory.kalman, stretch, fresh.kalman)
-    outage = VirtualOutage.begin(kalman.P)._replace(evidence=memory.outage.evidence)
-    errors = memory.errors._replace(residual=fresh.errors.residual, successive=fresh.errors.successive)
-    fix_noise = memory.fix_noise._replace(successive=fresh.fix_noise.successive)
-    span = stretch.seconds.sum(-1).to(memory.elapsed.dtype)
-    return memory._replace(
-        kalman=kalman, outage=outage, errors=errors, fix_noise=fix_noise,
-        elapsed=memory.elapsed + span, since_fix=memory.since_fix + span,
-    )  # fmt: skip

@@ -37,8 +37,7 @@ from dlkf.data.alignment import ALIGN, AlignConfig
 from dlkf.data.drive import Batch, Drive
 from dlkf.data.masks import withhold_fixes
 from dlkf.data.segments import whole_drives
-from dlkf.filters.aids.attach import append_aids
-from dlkf.filters.build import build_causal, is_filter
+from dlkf.filters.build import FilterName, build_causal, has_prior, is_filter
 from dlkf.filters.integration import BatchSolution, Estimator
 from dlkf.filters.tuning import Tuning
 from dlkf.navigation.imu_errors import ImuSpec
@@ -248,7 +247,7 @@ def find_noise(
             evidence = replace(evidence, compiler=compiler)
     sensors = [(s, k) for s in ("accel", "gyro") for k in OF_SENSORS]
     x = {f"{s}.{k}": max(float(getattr(getattr(imu, s), k)), 1e-7) for s, k in sensors}
-    car = {"nhc", "car"} & set(name.partition("+")[0].split("_"))
+    car = FilterName.parse(name).knows_car
     x |= {k: float(getattr(tuning, k)) for k in (*OF_GNSS, *(OF_CAR if car else ()))}
     start, usual = dict(x), {k: USUAL_OF_CAR if k in OF_CAR else USUAL for k in x}
     directions = [tuple(k for k in x if k.startswith(s)) for s in ("accel", "gyro")] + [(k,) for k in x]
@@ -307,7 +306,7 @@ def find_noise(
 
 def check_finds_noise(name: str) -> None:
     """InputError for ``imu=auto`` with a filter that takes no noise, or more than noise."""
-    if not is_filter(name) or name == "ins" or "prior" in name.split("_"):
+    if not is_filter(name) or name == "ins" or has_prior(name):
         what = "imu=auto finds the noise of a Kalman filter"
         raise InputError(f"{what}, model={name} takes none; give a preset or leave imu out, or take model=mbkf21_nhc")
 
@@ -322,7 +321,7 @@ def generic_filter(
     as :func:`check_finds_noise`.
     """
     check_finds_noise(name)
-    name = append_aids(name, [table.name for table in aids])
+    name = FilterName.parse(name).add(table.name for table in aids)
     found = find_noise(Evidence.of(drives, align=align), name, imu, tuning, **given)
     placed = [found.placing.apply(d) for d in drives]
     return build_causal(name, found.imu, "imu=auto does not", tuning=found.tuning), placed, found

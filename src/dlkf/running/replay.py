@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import warnings
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Protocol, TypeVar
 
@@ -16,6 +18,7 @@ from dlkf.base.errors import InputError, no_drives
 from dlkf.data.aid_tables import STANDARD, AidTable
 from dlkf.data.aids import LARGEST_VALUE, aid_values
 from dlkf.data.alignment import SEARCH, AlignConfig
+from dlkf.data.drive import Drive
 from dlkf.data.schema import ACCEL, GYRO, POSITION, STD, VELOCITY
 from dlkf.data.store import drive_from_tables, drive_rows
 from dlkf.data.tables import Columns
@@ -68,34 +71,28 @@ def replay_drive(
     tables of further sensors, which ``tables`` explain where they are not in the contract; their samples come
     ``late_s`` after their time.
     """
-    others = sorted(_aid_samples(aids or {}, tables), key=lambda sample: sample[1])
-    arrived = np.searchsorted(imu["t"], [sample[1] + late_s for sample in others], side="left")
-    fed = 0
-    when = gnss["t"] if arrival is None else np.asarray(arrival)
     samples = np.stack([imu[c] for c in ("t", *ACCEL, *GYRO)], -1)
     fixes = np.stack([gnss[c] for c in ("t", *POSITION, *VELOCITY, *STD)], -1)
-    order = np.argsort(when, kind="stable")
-    before = np.searchsorted(imu["t"], when[order], side="left")
-    done = 0
+    when = gnss["t"] if arrival is None else np.asarray(arrival)
+    others = sorted(_aid_samples(aids or {}, tables), key=lambda sample: sample[1])
 
     def fix(j: int) -> R:
         x = fixes[j].tolist()
         return stream.gnss(x[0], x[1], x[2], x[3], x[4:7], x[7:], int(gnss["quality"][j]))
 
+    order = np.argsort(when, kind="stable")
+    calls = [*(partial(fix, j) for j in order), *(partial(stream.aid, *sample) for sample in others)]
+    times = np.concatenate((when[order], [sample[1] + late_s for sample in others]))
+    before = np.searchsorted(imu["t"], times, side="left")
+    due = deque((before[k], calls[k]) for k in np.argsort(before, kind="stable"))
     for k, row in enumerate(samples):
-        while done < len(order) and before[done] <= k:
-            yield fix(order[done])
-            done += 1
-        while fed < len(others) and arrived[fed] <= k:
-            yield stream.aid(*others[fed])
-            fed += 1
+        while due and due[0][0] <= k:
+            yield due.popleft()[1]()
         x = row.tolist()
         yield stream.imu(x[0], x[1:4], x[4:])
     yield stream.finish()
-    for sample in others[fed:]:
-        yield stream.aid(*sample)
-    for j in order[done:]:
-        yield fix(j)
+    for _, call in due:
+        yield call()
 
 
 def _aid_samples(aids: Mapping[str, Columns], tables: Sequence[AidTable]) -> Iterator[tuple[str, float, float, float]]:
@@ -139,21 +136,21 @@ def stream_drive(
             reason = receipt.reason or "the filter diverged (its output is not finite)"
             raise InputError(f"drive {tables.row.name}: {reason}")
     if not found:
-        try:
-            start.align(drive, causal)
-        except InputError as error:
-            raise UnalignedError(str(error)) from None
-        raise UnalignedError(f"drive {tables.row.name}: ends before a filter could start")
-    estimates = [found[t] for t in sorted(found)]
-    table = estimates_table(estimates)
+        raise find_why_unaligned(drive, tables.row.name, causal)
+    table = estimates_table([found[t] for t in sorted(found)])
+    lost = tuple(stream.lost_at)
     return Navigated(
-        tables.row.name,
-        estimates[0].t - epoch_s,
-        table,
-        refused=drive.refused,
-        restarts=tuple(stream.lost_at),
-        doubt=stream.doubt,
+        tables.row.name, min(found) - epoch_s, table, refused=drive.refused, restarts=lost, doubt=stream.doubt
     )
+
+
+def find_why_unaligned(drive: Drive, name: str, align: AlignConfig) -> UnalignedError:
+    """Why a stream of a drive gave no filter a start."""
+    try:
+        start.align(drive, align)
+    except InputError as error:
+        return UnalignedError(str(error))
+    return UnalignedError(f"drive {name}: ends before a filter could start")
 
 
 def stream_drives(

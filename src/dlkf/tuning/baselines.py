@@ -8,11 +8,11 @@ from typing import Any
 
 from dlkf.data.drive import Batch
 from dlkf.evaluation.metrics import PVA
-from dlkf.filters.build import build_causal, build_filter, has_prior
+from dlkf.filters.build import FilterName, build_causal, build_filter, has_prior
 from dlkf.filters.smoother import Filter
 from dlkf.filters.tuning import Prior, Tuning
 from dlkf.navigation.imu_errors import ImuSpec
-from dlkf.tuning.search import best_prior, drop_prior, evaluate_objective, tune_under_bar
+from dlkf.tuning.search import best_prior, evaluate_objective, tune_under_bar
 
 FIRST = "mbkf15"  # where the others' search starts, and what the mean IMU error is estimated with
 
@@ -63,7 +63,7 @@ def tune_baselines(
     priors: dict[str, Prior] = {}
     tunings: dict[str, Tuning] = {}
     for name in names:
-        begun = Tuning() if name == "ins" else tunings.get(drop_prior(name), first)
+        begun = Tuning() if name == "ins" else tunings.get(FilterName.parse(name).drop("prior"), first)
         if name == f"{FIRST}_prior":
             priors[name], begun = prior, begin
         elif has_prior(name):

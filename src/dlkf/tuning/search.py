@@ -21,7 +21,7 @@ from dlkf.base.console import ProgressCallback, show_progress, warn_once
 from dlkf.base.errors import InputError
 from dlkf.data.drive import Batch
 from dlkf.evaluation.metrics import PVA, end_errors, geometric_mean, mean_error, segment_errors
-from dlkf.filters.build import build_causal
+from dlkf.filters.build import FilterName, build_causal
 from dlkf.filters.integration import Estimator, integrate
 from dlkf.filters.model_based import Mbkf, bias_sigma
 from dlkf.filters.tuning import Prior, Tuning
@@ -68,8 +68,8 @@ class Trial(NamedTuple):
 def list_factors(name: str) -> dict[str, tuple[float, ...]]:
     """The factors of a filter that a search tries, and their values."""
     found = dict(FACTORS)
-    kind, *aids = name.split("+")
-    for part in (*kind.split("_"), *aids):
+    base, endings, own = FilterName.parse(name)
+    for part in (base, *endings, *own):
         found |= MORE_FACTORS.get(part, {})
     return found
 
@@ -175,11 +175,6 @@ def _fits_c(estimator: Estimator, batches: Sequence[Batch]) -> bool:
     return True
 
 
-def drop_prior(name: str) -> str:
-    """The name of the same filter without prior information."""
-    return "_".join(part for part in name.split("_") if part != "prior")
-
-
 def mean_imu_error(imu: ImuSpec, tuning: Tuning, batches: Sequence[Batch], name: str = "mbkf15") -> Prior:
     """Mean and spread of the IMU error over training segments, as a filter estimates it with GNSS.
 
@@ -236,7 +231,8 @@ def best_prior(
     scatter where all drives share one IMU, and then too wide or, of many segments together, too narrow.
     """
     tunings = list(dict.fromkeys(tunings))
-    known = [mean_imu_error(imu, tuning, longer or batches, drop_prior(name)) for tuning in tunings]
+    without_prior = FilterName.parse(name).drop("prior")
+    known = [mean_imu_error(imu, tuning, longer or batches, without_prior) for tuning in tunings]
     spreads = product(BIAS_SPREADS, MATRIX_SPREADS if len(known[0].mean) > 6 else (1.0,))
     trials = [(p.scale_spread(*spread), tuning) for spread in spreads for p in known for tuning in tunings]
     in_c = _fits_c(build_causal(name, imu, "a prior does not", prior=trials[0][0]), batches)

@@ -23,7 +23,7 @@ from dlkf.evaluation.metrics import OBJECTIVES, PVA, outage_intervals
 from dlkf.evaluation.protocol import Protocol, Scenes, describe_short
 from dlkf.evaluation.summary import FEW
 from dlkf.evaluation.table import ResultTable, as_markdown, format_number
-from dlkf.filters.build import build_causal, has_prior, is_filter
+from dlkf.filters.build import FilterName, build_causal, has_prior, is_filter
 from dlkf.filters.tuning import FittedOn, Prior, Tuning
 from dlkf.navigation.imu_errors import ImuSpec
 from dlkf.running.likelihood import NO_OFFSET, NoiseFit
@@ -68,7 +68,7 @@ def check_settings(model: str, objective: str) -> None:
     """Raises InputError for a name that is no Kalman filter to be tuned, or an unknown objective."""
     if not is_filter(model) or model == "ins":
         raise InputError(f"model={model} has no noise to tune; give the name of a Kalman filter, such as mbkf21")
-    if "rts" in model.split("_"):
+    if "rts" in FilterName.parse(model).endings:
         raise InputError(f"model={model} is smoothed, its noise is that of the filter; tune it without _rts")
     if has_prior(model) and objective == LIKELIHOOD:
         raise InputError(f"model={model}: the noise of an IMU does not depend on a prior; give the name without _prior")

@@ -130,7 +130,7 @@ def test_a_heading_wrong_by_any_angle_is_corrected(drives, turn_deg):
         wrong = level_attitude(rotation_from_rpy(yaw) @ C, force_b, C @ force_b)
         std = torch.cat((s.std[:8], s.std.new_tensor([math.radians(15)])))  # coarse: the ring takes part
         start = replace(s, first=0, state=s.state._replace(C_nb=wrong), std=std)
-        cases.append(Case(d.part(s.first, d.epochs), start, force_b, None))
+        cases.append(Case(d.part(s.first, d.epochs), start, force_b))
     bank, first = begin_bank(cases), [align(d).first for d in drives]
     for t in range(20):
         imu = torch.stack([c.drive.imu[t] for c in cases]).double()
@@ -148,7 +148,7 @@ def test_the_stated_spread_grows_by_the_gyroscope_s_error_on_the_way_back(drives
     """With P diagonal, var = P_ψψ + (c t)² P_gyro + S t, in closed form, c of the down axis of a level car."""
     d = drives[0]
     s = align(d)
-    bank = begin_bank([Case(d.part(s.first, d.epochs), replace(s, first=0), mean_force(d, s.first), None)])
+    bank = begin_bank([Case(d.part(s.first, d.epochs), replace(s, first=0), mean_force(d, s.first))])
     now, then = yaw_std(bank, 0.0)[0], yaw_std(bank, 10.0)[0]
     added = OVERBOUND**2 * ((10 * 3e-2) ** 2 + 10 * 5e-4**2)
     assert now < then and abs(float(then**2 - now**2) - added) < 1e-3 * added

@@ -9,13 +9,13 @@ from typing import Any
 
 from dlkf.base.errors import InputError
 from dlkf.data.aid_tables import AidTable, standard_tables
-from dlkf.filters.aids.g_sensitivity import GSensitivity
 from dlkf.filters.aids.heading import DualAntennaHeading
 from dlkf.filters.aids.height import Barometer
-from dlkf.filters.aids.receiver import Receiver
 from dlkf.filters.aids.wheel_speed import WheelSpeed
 from dlkf.filters.constraints import CarConstraints
+from dlkf.filters.g_sensitivity import GSensitivity
 from dlkf.filters.model_based import Mbkf
+from dlkf.filters.receiver import Receiver
 from dlkf.filters.smoother import SmoothedSolution
 from dlkf.filters.sources import Source
 from dlkf.filters.vibration_speed import VibrationSpeed
@@ -88,14 +88,6 @@ def add_chosen_aids(name: str, model: Any, aids: Sequence[str] | str) -> Any:
             f"name, model=mbkf15+{unused[0]}"
         )
     return model
-
-
-def append_aids(name: str, aids: Iterable[str]) -> str:
-    """The name of a Kalman filter with vehicle constraints, with these sensors behind a plus; another unchanged."""
-    kind, *own = name.split("+")
-    if not {"nhc", "car"} & set(kind.split("_")):
-        return name
-    return "+".join((name, *(aid for aid in aids if aid not in own)))
 
 
 def describe_aids(models: Mapping[str, Any], tables: Iterable[AidTable]) -> list[str]:

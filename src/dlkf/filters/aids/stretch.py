@@ -39,5 +39,5 @@ def weighted_mean(weights: Float[Tensor, "B m"], values: Float[Tensor, "B m ..."
 
 def mean_force(epoch: Epoch) -> Float[Tensor, "B 3"]:
     """Mean specific force of the window in n [m/s²]."""
-    T = epoch.dt * epoch.imu.shape[1]
+    T = epoch.span_s
     return (epoch.window.end.v_n - epoch.start.v_n) / T - epoch.window.gravity

@@ -121,7 +121,7 @@ class WheelSpeed(SensorSource):
         again = torch.where(z.abs() < 0.5 * KMH, (1 + repeats).square(), 1.0)
         z, R = torch.where(rounded, of_cell[0], z), torch.where(rounded, of_cell[1] * again, R)
         moving = used & turns & (unsure < KNOWS**2)
-        calmest = memory.calmest * math.exp(epoch.dt * epoch.imu.shape[1] / MEMORY_S)
+        calmest = memory.calmest * math.exp(epoch.span_s / MEMORY_S)
         memory = WheelMemory(
             memory.std, trust, torch.where(seen, value, memory.last), repeats, whole,
             memory.signed | (used & ~reverse & (value < BACKWARDS)),

@@ -30,9 +30,10 @@ from dlkf.data.segments import whole_drives
 from dlkf.data.velocity_fit import JOLT_STD, scale_std
 from dlkf.filters.constraints import CarConstraints
 from dlkf.filters.gating import Gate
+from dlkf.filters.gnss_fix import GnssFix
 from dlkf.filters.integration import Covariances, Epoch, Fix, Step, advance
 from dlkf.filters.model_based import Mbkf
-from dlkf.filters.sources import GnssFix, Predicted
+from dlkf.filters.sources import Predicted
 from dlkf.filters.stationarity import VibrationLevel
 from dlkf.filters.tuning import Tuning
 from dlkf.navigation.attitude import rotation_from_rpy, vector_from_rotation
@@ -77,15 +78,14 @@ class Sideslip(CarConstraints):
 class Case:
     """A drive from the bank's first boundary on, the start there by course, and the mean specific force there [m/s²].
 
-    ``gyro``: bias of the gyroscopes and its 1σ [rad/s], if known. ``rest_force``: specific force of the last standstill
-    carried to the boundary's axes, and 1σ [rad] of its direction; None where the car has not been at rest.
-    ``scatter``: how many times more than claimed positions and velocities scatter.
+    ``rest_force``: specific force of the last standstill carried to the boundary's axes, and 1σ [rad] of its direction;
+    None where the car has not been at rest. ``scatter``: how many times more than claimed positions and velocities
+    scatter.
     """
 
     drive: Drive
     start: Start
     force_b: Float[Tensor, " 3"]
-    gyro: Float[Tensor, " 6"] | None
     rest_force: tuple[Float[Tensor, " 3"], float] | None = None
     scatter: tuple[float, float] = (1.0, 1.0)
 
@@ -132,7 +132,7 @@ def begin_bank(cases: Sequence[Case]) -> Bank:
     ring = 2 * math.pi / RING * (torch.arange(RING, dtype=torch.float64) + 0.5)
     turns = torch.cat((torch.tensor([0.0, math.pi], dtype=torch.float64), ring))
     turned = rotation_from_rpy(torch.stack((0 * turns, 0 * turns, turns), -1))
-    batch = whole_drives([c.drive.part(0, 1) for c in cases], [replace(c.start, gyro=c.gyro) for c in cases])
+    batch = whole_drives([c.drive.part(0, 1) for c in cases], [c.start for c in cases])
     C, std, score = [], [], []
     for case in cases:
         start = case.start

@@ -198,7 +198,7 @@ class FirstMotion:
         ahead = self.drive.part(self.row, self.drive.epochs)
         level = carry_level(self.drive, self.rest, self.row, self.gyros)
         position, velocity = self.aligned.scatter[self.row].tolist()
-        return Case(ahead, replace(self.start, first=0), self.force_b, self.gyro, level, (position, velocity))
+        return Case(ahead, replace(self.start, first=0), self.force_b, level, (position, velocity))
 
     def best_course(self, search_s: float) -> tuple[Tensor, float]:
         """The course where it is best known within so many seconds, carried back: attitude in n, 1σ of its yaw."""
