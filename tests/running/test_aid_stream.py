@@ -117,3 +117,21 @@ def test_what_cannot_be_taken_is_refused_with_a_reason(tables):
         stream.imu(0.02 * k, (0.0, 0.0, -9.81), (0.0, 0.0, 0.0))
     assert "s late" in stream.speed(0.5, 3.0).reason and "ahead of the IMU" in stream.speed(60.0, 3.0).reason
     assert stream.speed(19.9, 3.0).status is Status.REPLAYED and "again" in stream.speed(19.9, 3.0).reason
+
+
+def test_a_bridged_gap_has_no_measurements_of_sensors(tables):
+    """No sensor is used in it: innovations are unknown there, the estimates of its parameters stay."""
+    t = tables.imu["t"]
+    imu = {k: v[(t < 22.3) | (t > 22.8)] for k, v in tables.imu.items()}
+    stream = StreamingFilter(_filters()["mbkf21_car"])
+    rows, said = {}, []
+    for receipt in replay_drive(stream, imu, tables.gnss, aids=tables.aids):
+        rows.update((round(e.t, 6), e.row) for e in receipt.estimates)
+        said.append(receipt.status)
+    assert Status.BRIDGED in said
+    end = min(t for t in rows if t > 22.8)
+    assert rows[end - 1]["speed_used"] == 1.0
+    for sensor in ("speed", "heading", "baro"):
+        said = [rows[end][f"{sensor}_{x}"] for x in ("innovation", "innovation_std", "used")]
+        assert np.isnan(said[:2]).all() and said[2] == 0.0
+    assert rows[end]["wheel_scale"] == pytest.approx(rows[end - 1]["wheel_scale"])

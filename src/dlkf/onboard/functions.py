@@ -24,7 +24,7 @@ from torch import Tensor, nn
 from dlkf.data.aid_tables import AidTable
 from dlkf.data.aids import ROW as AID_ROW
 from dlkf.data.drive import Batch
-from dlkf.filters.aids.attach import aid_columns, find_tables
+from dlkf.filters.aids.attach import aid_columns, find_tables, unmeasured_value
 from dlkf.filters.integration import Estimator, Fix, Step, advance
 from dlkf.navigation.calibration import ImuError
 from dlkf.navigation.earth import NOMINAL_GRAVITY, TangentFrame, tangent_frame
@@ -300,6 +300,10 @@ class Bridge(Function):
         std = bridge_std(part["std"], x.memory, after.memory)
         none = {"innovation", "rejected", "used"}
         part |= {name: torch.zeros_like(part[name]) for name in none} | {"prior": part["posterior"], "std": std}
+        of_nothing = [unmeasured_value(column) for column in aid_columns(self.estimator)]
+        if of_nothing:
+            stays = torch.tensor([value is None for value in of_nothing])
+            part["aids"] = torch.where(stays, part["aids"], outputs.new_tensor([value or 0.0 for value in of_nothing]))
         return self.layout.pack(after), torch.cat([part[name].double() for name in (*OUTPUTS, "aids")], -1)
 
 

@@ -18,7 +18,7 @@ from dlkf.data.drive import Batch, Drive
 from dlkf.data.resampling import BLANK, FixRows
 from dlkf.data.segments import REST, whole_drives
 from dlkf.data.velocity_fit import READ_S
-from dlkf.filters.aids.attach import aid_columns
+from dlkf.filters.aids.attach import aid_columns, unmeasured_value
 from dlkf.filters.integration import Estimator, Fix, advance
 from dlkf.navigation.calibration import ImuError
 from dlkf.navigation.earth import TangentFrame
@@ -133,7 +133,9 @@ class EpochFilter:
         std = latest.std if latest.std is None else bridge_std(latest.std, running.memory, memory)
         self.running = running._replace(memory=memory, state=end)
         t, frame = self._boundary(self._number), running.frame
-        self.latest = replace(latest, t=t, frame=frame, state=end, std=std, gnss_used=False)
+        of_nothing = {name: unmeasured_value(name) for name in latest.aids or {}}
+        aids = {n: x if of_nothing[n] is None else of_nothing[n] for n, x in (latest.aids or {}).items()}
+        self.latest = replace(latest, t=t, frame=frame, state=end, std=std, gnss_used=False, aids=aids or None)
         return [self.latest]
 
     def replay(self, boundary: int) -> list[Estimate]:

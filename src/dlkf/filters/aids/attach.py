@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import is_dataclass, replace
 from typing import Any
@@ -128,6 +129,13 @@ def aid_columns(model: Any) -> tuple[str, ...]:
         else:
             said += getattr(source, "columns", ())
     return (*said, *states.others, *(f"std_{name}" for name in states.others))
+
+
+def unmeasured_value(column: str) -> float | None:
+    """What one of :func:`aid_columns` says of an update interval without a measurement; None: an estimate, which stays."""
+    if column.endswith(("_innovation", "_innovation_std")):
+        return math.nan
+    return 0.0 if column.endswith("_used") else None
 
 
 def _set_states(source: Any, states: ErrorStates) -> Any:
