@@ -18,6 +18,8 @@ from numpy.typing import NDArray
 from dlkf.base.angles import wrap_angle
 from dlkf.data.discovery.motion import MOVING, RESTING, Complex, Floats, Motion
 from dlkf.data.readers.units import WEEK_S
+from dlkf.data.schema import ACCEL, GYRO, stack_columns
+from dlkf.data.tables import Columns
 from dlkf.navigation.earth import STANDARD_GRAVITY
 
 STEP_S = 0.25
@@ -75,6 +77,11 @@ class ImuSums:
         for k, axis in enumerate((*accel.T, *gyro.T), 1):
             np.cumsum(axis * step, out=sums[:, k])
         return ImuSums(t, sums)
+
+    @staticmethod
+    def of_table(imu: Columns) -> ImuSums:
+        """Of the samples of a drive."""
+        return ImuSums.of(imu["t"], stack_columns(imu, ACCEL), stack_columns(imu, GYRO))
 
     def between(self, first_s: float, last_s: float) -> ImuSums:
         """The part within these times."""
