@@ -71,6 +71,14 @@ def test_logs_of_which_nothing_is_known(tmp_path, drive):
     assert read_table(tmp_path / "out", "imu", "monday") is not None
 
 
+def test_a_folder_with_a_date_for_a_name(tmp_path, drive):
+    """Not the year alone, as of a file what stands before the first point."""
+    _hidden(tmp_path / "2025.07.05", drive)
+    for reader in (AutoReader(), LogReader({"file": "box.txt"}, {"file": "receiver.csv"})):
+        assert reader.places(tmp_path / "2025.07.05") == [(tmp_path / "2025.07.05", "2025.07.05", None)]
+        assert [name for _, name, _ in reader.places(tmp_path / "2025.07.05" / "box.txt")] == ["box"]
+
+
 def _table(text, name="a.csv"):
     return LogTable(pd.read_csv(io.StringIO(text)), Path(name))
 

@@ -13,9 +13,10 @@ from dlkf.data.intake import ingest_drives
 from dlkf.data.readers import units
 from dlkf.data.readers.auto import AutoReader
 from dlkf.data.readers.frames import LogTable
+from dlkf.data.readers.mapping import Mapped
 from dlkf.data.readers.qualities import quality_spec
 from dlkf.data.readers.recognise import gnss_spec, imu_spec
-from dlkf.data.readers.stamps import choose_clock
+from dlkf.data.readers.stamps import choose_clock, epoch_note
 from dlkf.data.readers.units import day_order
 from dlkf.data.readers.vocabulary import (
     DATE,
@@ -81,6 +82,14 @@ def write(folder: Path, tables, names, **text) -> None:
 
 
 IN_DAILY_USE = "English", "nothing"  # the others: make test
+
+
+def test_of_several_columns_of_numbers_the_last_is_the_stamp():
+    """As the rows are read; the line on what they count is of it too."""
+    table = LogTable(pd.DataFrame({"day": ["2025-07-05"] * 2, "stamp": [UNIX, UNIX + 1]}), Path("fixes.csv"))
+    mapped = Mapped(table, {"format": "csv", "time": {"column": ["day", "stamp"]}}, "gnss")
+    assert mapped.own_stamps()[0].tolist() == [int(UNIX), int(UNIX) + 1]
+    assert "(day, stamp): taken as Unix time (since 1970), of 2025-" in str(epoch_note(mapped))
 
 
 @pytest.mark.parametrize(

@@ -105,6 +105,12 @@ def _look_back(tables: Tables) -> Tables:
 GYRO, ACCEL = ["gyro_x", "gyro_y", "gyro_z"], ["accel_x", "accel_y", "accel_z"]
 
 
+def _turn_up(tables: Tables) -> Tables:
+    """The gyroscope's z counts the other way, beside a receiver without velocities."""
+    gnss = tables["gnss"].assign(**dict.fromkeys(("vel_n", "vel_e", "vel_d"), np.nan))
+    return {**_columns("imu", _scale(["gyro_z"], -1))(tables), "gnss": gnss}
+
+
 def _freeze(first: int, last: int):
     def frozen(f):
         values = f[[*ACCEL, *GYRO]].to_numpy().copy()
@@ -147,6 +153,7 @@ BAD = {
     "no gravity": (_columns("imu", _scale(["accel_z"], 0.01)), "median specific force"),
     "z up": (_columns("imu", _scale(["accel_y", "accel_z", "gyro_y", "gyro_z"], -1)), "points up"),
     "gyro z up": (_columns("imu", _scale(["gyro_z"], -1)), "gyro_z turns against the course"),
+    "gyro z up, positions alone": (_turn_up, "gyro_z turns against the course"),
     "wrong axis": (_columns("imu", _swap("accel_x", "accel_z")), "gravity lies on accel_x"),
     "swapped position": (_columns("gnss", _swap("lat_deg", "lon_deg")), "latitude and longitude look"),
     "latitude out of range": (_columns("gnss", _scale(["lat_deg"], 2)), "lat_deg is 97.*swapped"),

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import pandas as pd
 import yaml
 
 from dlkf.base.errors import InputError
@@ -220,27 +219,20 @@ def split_at_gaps(drive: DriveFrames, shortest_s: float, limits: Limits) -> Iter
         yield drive
         return
     edges = np.concatenate(([0], gaps, [len(t)]))
+    tables = {"gnss": drive.gnss, "reference": drive.reference, **drive.aids}
     count = 0
     for first, last in pairwise(edges):
         begin, end = t[first], t[last - 1]
-        gnss = None if drive.gnss is None else _between(drive.gnss, begin, end)
-        if end - begin < shortest_s or (gnss is not None and not len(gnss)):
+        cut = {kind: table[table["t"].between(begin, end)] for kind, table in tables.items() if table is not None}
+        kept = {kind: table.reset_index(drop=True) for kind, table in cut.items() if len(table)}
+        if end - begin < shortest_s or (drive.gnss is not None and "gnss" not in kept):
             continue
-        reference = None if drive.reference is None else _between(drive.reference, begin, end)
-        if reference is not None and not len(reference):
-            reference = None
-        aids = {kind: _between(table, begin, end) for kind, table in drive.aids.items()}
         yield replace(
             drive,
             meta={**drive.meta, "drive": f"{drive.name}-s{count}"},
             imu=drive.imu.iloc[first:last].reset_index(drop=True),
-            gnss=gnss,
-            reference=reference,
-            aids={kind: table for kind, table in aids.items() if len(table)},
+            gnss=kept.pop("gnss", None),
+            reference=kept.pop("reference", None),
+            aids=kept,
         )
         count += 1
-
-
-def _between(frame: pd.DataFrame, begin: float, end: float) -> pd.DataFrame:
-    t = frame["t"]
-    return frame[(t >= begin) & (t <= end)].reset_index(drop=True)

@@ -9,7 +9,7 @@ the good one (:class:`FixScreen`).
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -108,8 +108,9 @@ class FixScreen:
     def find_refusal(self, t: float, place: tuple[float, float, float], speed: float, std: np.ndarray) -> str:
         """Why a fix cannot be: time [s], lat [°], lon [°], height [m], speed [m/s], 1σ (6); empty if it can."""
         lat, lon, height = place
-        if reason := find_implausible(lat, lon, height, speed, std):
-            return reason
+        for said, beyond in _find_faults(lat, lon, height, speed, std).items():
+            if beyond:
+                return said.format(height=height, speed=speed)
         fix = GoodFix(t, lat, lon, height, float(_spread(std[:3])), t)
         if self._good is None:
             return self._take(fix)
@@ -146,17 +147,17 @@ class FixScreen:
         return bool(is_reachable(abs(b.t - a.t), way, b.height_m - a.height_m, a.std_m + b.std_m))
 
 
-def find_implausible(lat: float, lon: float, height: float, speed: float, std: np.ndarray) -> str:
-    """What is beyond the limits in one fix by itself, or nothing."""
-    if abs(lat) < NOWHERE_DEG and abs(lon) < NOWHERE_DEG:
-        return "at 0°/0°: no position yet"
-    if not HEIGHTS_M[0] <= height <= HEIGHTS_M[1]:
-        return f"height {height:.4g} m lies outside {HEIGHTS_M[0]:g} to {HEIGHTS_M[1]:g} m"
-    if speed > FASTEST_M_S:
-        return f"a velocity of {speed:.4g} m/s is beyond any car"
-    if (np.nan_to_num(std, nan=0.0) > LARGEST_STD).any():
-        return f"a 1σ beyond {LARGEST_STD:g} m or m/s"
-    return ""
+def _find_faults(lat, lon, height, speed, std) -> dict[str, Any]:
+    """Which fixes are beyond the limits by themselves, by what is wrong with them; ``std`` (…, 6)."""
+    with np.errstate(invalid="ignore"):
+        return {
+            "at 0°/0°: no position yet": (np.abs(lat) < NOWHERE_DEG) & (np.abs(lon) < NOWHERE_DEG),
+            f"height {{height:.4g}} m lies outside {HEIGHTS_M[0]:g} to {HEIGHTS_M[1]:g} m": (
+                (height < HEIGHTS_M[0]) | (height > HEIGHTS_M[1])
+            ),
+            "a velocity of {speed:.4g} m/s is beyond any car": speed > FASTEST_M_S,
+            f"a 1σ beyond {LARGEST_STD:g} m or m/s": (np.nan_to_num(std, nan=0.0) > LARGEST_STD).any(-1),
+        }
 
 
 class Screened(NamedTuple):
@@ -175,16 +176,10 @@ def screen_fixes(gnss: dict[str, np.ndarray]) -> Screened:
     spread = _spread(std[:, :3])
     keep = np.ones(len(t), bool)
     way = horizontal_distance(lat[:-1], lon[:-1], lat[1:], lon[1:])
-    still = (np.diff(lat) == 0) & (np.diff(lon) == 0)
-    with np.errstate(invalid="ignore"):
-        alone = (
-            ((np.abs(lat) < NOWHERE_DEG) & (np.abs(lon) < NOWHERE_DEG))
-            | (height < HEIGHTS_M[0]) | (height > HEIGHTS_M[1]) | (speed > FASTEST_M_S)
-            | (np.nan_to_num(std, nan=0.0) > LARGEST_STD).any(-1)
-        )  # fmt: skip
-        frozen = still & (speed[1:] > FROZEN_SPEED_M_S)
+    frozen = (np.diff(lat) == 0) & (np.diff(lon) == 0) & (speed[1:] > FROZEN_SPEED_M_S)
     apart = ~is_reachable(np.diff(t), way, np.diff(height), spread[:-1] + spread[1:])
-    if not (alone.any() or apart.any() or frozen.any()):
+    alone = _find_faults(lat, lon, height, speed, std).values()
+    if not (any(x.any() for x in alone) or apart.any() or frozen.any()):
         return Screened(keep, "", [])
     screen, first = FixScreen(), ""
     for k in range(len(t)):

@@ -230,20 +230,20 @@ def _check_climb(gnss: Columns, where: str) -> None:
     raise InputError(f"{where}: heights change {climb.slope:.3g} times as much as the vertical velocity says: {remedy}")
 
 
-def check_clocks(imu: Columns, gnss: Columns, where: str) -> None:
+def check_clocks(imu: Columns, fixes: Columns, where: str) -> None:
     """The yaw rate and the horizontal force agree with GNSS as the clocks stand, or at no offset clearly better.
 
     Then the force forward and right also shows whether the sensor looks along the car.
     """
-    t, accel, gyro, moved = _signals(imu, gnss)
+    moved = find_motion(fixes)
     check_dead_axes(imu, moved, where)
-    sums = ImuSums.of(t, accel, gyro)
+    sums = ImuSums.of_table(imu)
     _check_drift(sums, moved, where)
     best = find_lag(sums, moved, SEARCH_S)
-    if (best is None or not best.certain) and not np.isfinite(gnss["vel_n"]).any():
-        moved = fit_motion(gnss)
+    if (best is None or not best.certain) and not np.isfinite(fixes["vel_n"]).any():
+        moved = fit_motion(fixes)
         best = find_lag(sums, moved, SEARCH_S)
-    _check_handedness(t, accel, gyro, moved, best, where)
+    _check_handedness(imu, moved, best, where)
     if best is None or not best.certain:
         return
     if abs(best.lag_s) > APART_S:
@@ -265,13 +265,11 @@ def check_clocks(imu: Columns, gnss: Columns, where: str) -> None:
         )
 
 
-def _check_handedness(
-    t: np.ndarray, accel: np.ndarray, gyro: np.ndarray, gnss: Motion, best: Lag | None, where: str
-) -> None:
+def _check_handedness(imu: Columns, gnss: Motion, best: Lag | None, where: str) -> None:
     """Turns agree with GNSS, accelerations only when an axis is turned round: the axes are left-handed."""
     if best is None or best.yaw < YAW_AGREES or best.force > FORCE_DISAGREES or abs(best.lag_s) > APART_S:
         return
-    mirrored = find_lag(ImuSums.of(t, accel * np.array([1.0, -1.0, 1.0]), gyro), gnss, APART_S)
+    mirrored = find_lag(ImuSums.of_table(imu | {"accel_y": -imu["accel_y"]}), gnss, APART_S)
     if mirrored is None or mirrored.force < FORCE_AGREES:
         return
     quarter = round(float(mirrored.angle) / (np.pi / 2)) % 4
@@ -309,13 +307,13 @@ def _check_drift(imu: ImuSums, gnss: Motion, where: str) -> None:
 
 def describe_drift(imu: Columns, gnss: Columns) -> str | None:
     """A line about clocks that drift apart by less than :func:`check_clocks` refuses; None where none is found."""
-    t, accel, gyro, moved = _signals(imu, gnss)
-    ends = compare_ends(ImuSums.of(t, accel, gyro), moved)
+    moved = find_motion(gnss)
+    ends = compare_ends(ImuSums.of_table(imu), moved)
     span = float(moved.t[-1] - moved.t[0]) if len(moved.t) else 0.0
     if span < SHORTEST_S or (ends is not None and abs(ends.drift) * span < DRIFTED_S - ROUGH_S):
         return None
     lag_s = 0.5 * (ends.first_s + ends.last_s) if ends is not None else 0.0
-    pose = find_drifting_pose(t, accel, gyro, moved, lag_s)
+    pose = find_drifting_pose(imu["t"], stack_columns(imu, ACCEL), stack_columns(imu, GYRO), moved, lag_s)
     if pose is None or abs(pose.drift) * span < DRIFTED_S:
         return None
     return (
@@ -327,8 +325,7 @@ def describe_drift(imu: Columns, gnss: Columns) -> str | None:
 
 def describe_rotation(imu: Columns, gnss: Columns) -> str | None:
     """A line about a sensor that seems turned, where it is not so clear that :func:`check_clocks` refuses it."""
-    t, accel, gyro, moved = _signals(imu, gnss)
-    best = find_lag(ImuSums.of(t, accel, gyro), moved, APART_S)
+    best = find_lag(ImuSums.of_table(imu), find_motion(gnss), APART_S)
     if best is None or not best.clear or not min(best.yaw, best.force) > 0.6:
         return None
     turned = np.degrees(best.angle)
@@ -338,7 +335,3 @@ def describe_rotation(imu: Columns, gnss: Columns) -> str | None:
         f"the IMU seems turned by {turned:+.0f}° about the vertical (accelerations and GNSS agree to {best.force:.2f} "
         "then): dlkf doctor looks closer, reader.imu.accel.axes=auto and gyro.axes=auto find it"
     )
-
-
-def _signals(imu: Columns, gnss: Columns) -> tuple[np.ndarray, np.ndarray, np.ndarray, Motion]:
-    return imu["t"], stack_columns(imu, ACCEL), stack_columns(imu, GYRO), find_motion(gnss)

@@ -13,7 +13,7 @@ from dlkf.data.discovery.clock import ImuSums, describe_offset, find_lag
 from dlkf.data.discovery.motion import find_motion
 from dlkf.data.limits import DEGREE_M
 from dlkf.data.plausibility import APART_S, TURNED_DEG
-from dlkf.data.schema import ACCEL, ATTITUDE, GYRO, stack_columns
+from dlkf.data.schema import ATTITUDE
 from dlkf.data.tables import Columns
 
 SAME_S = 1.0  # between a fix and a row of the reference that are compared
@@ -148,5 +148,5 @@ def _looks_forward(imu: Columns, reference: Columns) -> bool:
     """Whether the force along the sensor's x axis is that of a motion along it."""
     whole = np.unique(np.floor(reference["t"]), return_index=True)[1]  # one row a second
     moved = find_motion({name: values[whole] for name, values in reference.items()})
-    best = find_lag(ImuSums.of(imu["t"], stack_columns(imu, ACCEL), stack_columns(imu, GYRO)), moved, APART_S)
+    best = find_lag(ImuSums.of_table(imu), moved, APART_S)
     return best is not None and best.force > FORCE_AGREES and abs(best.angle) < np.radians(TURNED_DEG[0])

@@ -102,16 +102,16 @@ def check_tables(tables: CheckedTables, limits: Limits = LIMITS) -> CheckedTable
     refused = Refused(len(tables.imu["t"]) - len(imu["t"]), len(tables.gnss["t"]) - len(gnss["t"]))
     if any(refused):
         tables = replace(tables, imu=imu, gnss=gnss, refused=refused)
-    check_frozen(imu, read_fixes(gnss), _where(name, "imu"))
-    check_turns(imu, read_fixes(gnss), _where(name, "imu"))
-    check_clocks(imu, read_fixes(gnss), _where(name, "imu"))
+    fixes = read_fixes(gnss)
+    check_frozen(imu, fixes, _where(name, "imu"))
+    check_turns(imu, fixes, _where(name, "imu"))
+    check_clocks(imu, fixes, _where(name, "imu"))
     if truth is not None:
-        _check_reference(truth, imu, read_fixes(gnss), _where(name, "reference"))
-    if tables.aids:
-        moved = find_motion(read_fixes(gnss))
-        for kind, table in tables.aids.items():
-            check_time(table["t"], _where(name, kind), kind)
-            check_aid(kind, table, imu, moved, _where(name, kind))
+        _check_reference(truth, imu, fixes, _where(name, "reference"))
+    moved = find_motion(fixes)
+    for kind, table in tables.aids.items():
+        check_time(table["t"], _where(name, kind), kind)
+        check_aid(kind, table, imu, moved, _where(name, kind))
     return tables
 
 

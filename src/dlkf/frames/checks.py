@@ -42,10 +42,9 @@ def check_frames(imu: Any, gnss: Any, reference: Any = None, aids: Mapping[str, 
     """InputError for what is no frame, has no rows, lacks columns, or has text or dates where numbers belong."""
     from dlkf.data.schema import AIDS, OPTIONAL, SCHEMAS, VELOCITY
 
-    frames = {"imu": imu, "gnss": gnss, "reference": reference, **(aids or {})}
+    others = {"reference": reference, **(aids or {})}
+    frames = {"imu": imu, "gnss": gnss, **{name: frame for name, frame in others.items() if frame is not None}}
     for name, frame in frames.items():
-        if frame is None and name not in ("imu", "gnss"):
-            continue
         if not isinstance(frame, pd.DataFrame):
             raise InputError(f"{name} is a {type(frame).__name__}, must be a pandas DataFrame{_as_pandas(name, frame)}")
     if imu is gnss:
@@ -53,8 +52,6 @@ def check_frames(imu: Any, gnss: Any, reference: Any = None, aids: Mapping[str, 
     if "lat_deg" in imu and "accel_x" in gnss:
         raise InputError("imu and gnss look exchanged: imu has lat_deg, gnss has accel_x; imu comes first")
     for name, frame in frames.items():
-        if frame is None:
-            continue
         schema, more = {**SCHEMAS, **AIDS}[name], OPTIONAL[name]
         needed = ("t", "lat_deg", "lon_deg", "height_m") if name in ("gnss", "reference") else schema.names
         check_columns(name, frame, needed)
@@ -66,7 +63,7 @@ def check_frames(imu: Any, gnss: Any, reference: Any = None, aids: Mapping[str, 
             f"reference: {', '.join(unknown)} missing; errors are measured against positions and velocities, and "
             "without reference= against the drive smoothed with its fixes"
         )
-    _check_seconds({name: frame["t"].to_numpy(float) for name, frame in frames.items() if frame is not None})
+    _check_seconds({name: frames[name]["t"].to_numpy(float) for name in ("gnss", *frames)})
     _check_quality(gnss)
     if len(horizontal := [c for c in ("vel_n", "vel_e") if c in gnss]) == 1:
         raise InputError(f"gnss: has {horizontal[0]} alone; give vel_n and vel_e, or neither without velocities")
@@ -287,17 +284,6 @@ def check_aids(aids: Any) -> list[str]:
     return list(names)
 
 
-def check_imu_type(imu_type: Any) -> None:
-    """A preset of conf/imu, or what stands in one."""
-    if isinstance(imu_type, Mapping):
-        return
-    if imu_type == "auto":
-        raise InputError(
-            "imu_type='auto': only the command dlkf navigate finds the noise (imu=auto); give a preset, or model='plus'"
-        )
-    check_preset("imu", imu_type, "imu_type")
-
-
 def check_whole(name: str, value: Any, least: int) -> int:
     """A whole number from ``least`` on."""
     if isinstance(value, Integral) and not isinstance(value, bool):
@@ -327,12 +313,16 @@ def tuning_values(tuning: str | Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def imu_values(imu_type: str | Mapping[str, Any]) -> Mapping[str, Any]:
-    """The values of an IMU's error model."""
-    return _preset_values("imu", imu_type)
+    """The values of an IMU's error model: a preset of ``conf/imu``, or what stands in one."""
+    if isinstance(imu_type, str) and imu_type == "auto":
+        raise InputError(
+            "imu_type='auto': only the command dlkf navigate finds the noise (imu=auto); give a preset, or model='plus'"
+        )
+    return _preset_values("imu", imu_type, "imu_type")
 
 
-def _preset_values(group: str, given: str | Mapping[str, Any]) -> Mapping[str, Any]:
+def _preset_values(group: str, given: str | Mapping[str, Any], argument: str = "") -> Mapping[str, Any]:
     if isinstance(given, Mapping):
         return given
-    check_preset(group, given)
+    check_preset(group, given, argument)
     return read_preset(group, given)

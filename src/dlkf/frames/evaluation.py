@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
-from dlkf.frames.checks import check_above_zero, check_imu_type, check_models, imu_values, tuning_values
+from dlkf.frames.checks import check_above_zero, check_models, imu_values, tuning_values
 from dlkf.frames.dataset import drive_folder
 
 if TYPE_CHECKING:
@@ -129,12 +129,12 @@ def evaluate(
 
     names = check_models(models)
     check_above_zero(outage_s=outage_s)
-    check_imu_type(imu_type)
+    noise = imu_values(imu_type)
     aids = {"speed": speed, "heading": heading, "baro": baro}
     with drive_folder(imu, gnss, reference, lever_arm, aids) as folder:
         values = compose_command("evaluate", "model=ins", f"outage.duration_s={float(outage_s)}", resolve=False)
         values |= {"model": names, "dataset": str(folder), "mode": "drives", "out": "", "injected_bias": None}
-        values |= {"imu": imu_values(imu_type), "reference": "smoothed" if reference is None else "file"}
+        values |= {"imu": noise, "reference": "smoothed" if reference is None else "file"}
         values["tuning"] = dict(tuning_values(tuning))
         values["tracking"] = {"uri": None, "log": False}
         values.pop("hydra", None)

@@ -13,7 +13,6 @@ from dlkf.base.errors import count_calls
 from dlkf.frames.checks import (
     check_above_zero,
     check_aids,
-    check_imu_type,
     check_lever_arm,
     check_model,
     check_options,
@@ -108,7 +107,7 @@ def navigate(
     check_above_zero(**{name: value for name, value in given.items() if value is not None})
     check_switch("smoothed", smoothed)
     model = check_model(model)
-    check_imu_type(imu_type)
+    imu_values(imu_type)  # a wrong one is refused before any work
     aids = {"speed": speed, "heading": heading, "baro": baro}
     with drive_folder(imu, gnss, None, lever_arm, aids) as folder:
         chosen = choose_aids(folder, None)
@@ -160,9 +159,9 @@ def load(
 
     factors = settings_from(Tuning, tuning_values(tuning), "tuning")
     model = check_model(model)
-    check_imu_type(imu_type)
+    noise = imu_values(imu_type)
     with in_python():
-        resolved = resolve_model(model, imu_spec(imu_values(imu_type)), tuning=factors)
+        resolved = resolve_model(model, imu_spec(noise), tuning=factors)
     given = {"imu_type": imu_type, "tuning": tuning}
     if line := unused_settings(model, [name for name, value in given.items() if value != DEFAULT_NOISE[name]]):
         warnings.warn(line, UserWarning, stacklevel=count_calls())

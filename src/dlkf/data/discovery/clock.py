@@ -10,17 +10,22 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dlkf.base.angles import wrap_angle
 from dlkf.data.discovery.motion import MOVING, RESTING, Complex, Floats, Motion
 from dlkf.data.readers.units import WEEK_S
+from dlkf.data.schema import ACCEL, GYRO, stack_columns
+from dlkf.data.tables import Columns
 from dlkf.navigation.earth import STANDARD_GRAVITY
 
 STEP_S = 0.25
 LEAST_S = 20.0  # of common time in intervals with a known course
 NEIGHBOUR_S = 3.0  # lags this close belong to one peak
+LEAST_VARIANCE = 1e-3  # of the whole, that a stretch in which a signal hardly changes is taken to have
 FARTHEST_ZONE_H = 14.1  # Kiribati's
 YEAR_S = 31_557_600.0
 KNOWN_OFFSETS = {18.0: "leap seconds of GPS against UTC", 37.0: "TAI against UTC", 19.0: "TAI against GPS"}
@@ -73,6 +78,11 @@ class ImuSums:
             np.cumsum(axis * step, out=sums[:, k])
         return ImuSums(t, sums)
 
+    @staticmethod
+    def of_table(imu: Columns) -> ImuSums:
+        """Of the samples of a drive."""
+        return ImuSums.of(imu["t"], stack_columns(imu, ACCEL), stack_columns(imu, GYRO))
+
     def between(self, first_s: float, last_s: float) -> ImuSums:
         """The part within these times."""
         part = slice(*np.searchsorted(self.t, (first_s, last_s)))
@@ -104,7 +114,11 @@ def find_lag(imu: ImuSums, gnss: Motion, within_s: float | None = None) -> Lag |
     n = int(cell[-1]) + 1
     weight, r, a = np.zeros(n), np.zeros(n), np.zeros(n, complex)
     weight[cell], r[cell], a[cell] = 1.0, rate[known], pull[known]
-    gain, yaws, forces, angles, count = _scores(weight, r, a, there, yaw, force)
+    yaws, count = correlate(r, weight, yaw, there)
+    alike, _ = correlate(a, weight, force, there)
+    yaws, forces = np.clip(yaws, -0.9999, 0.9999), np.clip(np.abs(alike), 0.0, 0.9999)
+    gain = -0.5 * count * np.log1p(-(np.maximum(yaws, 0.0) ** 2)) - count * np.log1p(-(forces**2))
+    gain = np.where(count > 3, gain, 0.0)
     lags = (np.arange(len(gain)) - (n - 1)) * STEP_S + start - middle[0]
     allowed = count * usual >= LEAST_S
     if within_s is not None:
@@ -117,7 +131,7 @@ def find_lag(imu: ImuSums, gnss: Motion, within_s: float | None = None) -> Lag |
     rival = int(others.argmax())
     other = float(others[rival]) if np.isfinite(others[rival]) else 0.0
     peak = lags[best] + STEP_S * find_peak(gain[best - 1 : best + 2])
-    numbers = (lags[best], gain[best], other, yaws[best], forces[best], angles[best], peak)
+    numbers = (lags[best], gain[best], other, yaws[best], forces[best], -np.angle(alike[best]), peak)
     return Lag(*(float(x) for x in numbers))
 
 
@@ -193,42 +207,28 @@ def _imu_signals(imu: ImuSums, width_s: float) -> tuple[Floats, Complex, Floats,
     return -up @ means[4:], force, (means[0] > 0.9).astype(float), float(grid[0])
 
 
-def _scores(
-    weight: Floats, r: Floats, a: Complex, there: Floats, yaw: Floats, force: Complex
-) -> tuple[Floats, Floats, Floats, Floats, Floats]:
-    """Λ, both correlations, the sensor's yaw and the number of intervals of every lag.
+def correlate(
+    a: Floats | Complex, a_there: Floats, b: Floats | Complex, b_there: Floats
+) -> tuple[NDArray[Any], Floats]:
+    """Normalised correlation of b with a over all lags, and how many values there are of both (Padfield 2012: sums of
+    products by FFT, with masks of ones where there are values).
 
-    At index 0 the last fix lies on the first sample.
+    At index 0 the last value of a lies on the first one of b. Where one hardly changes its variance is taken for
+    ``LEAST_VARIANCE`` of that of the whole.
     """
     from scipy.fft import next_fast_len  # every start of navigate would load it
 
-    size = next_fast_len(len(weight) + len(there) - 1, real=True)
-    here = there > 0
-    scale, pull = (max(float(np.std(x[here])) if here.any() else 0.0, 1e-12) for x in (yaw, force))
-    r, a, g, f = r * weight, a * weight, yaw / scale * there, force / pull * there
-    r2, a2, g2, f2 = (np.abs(x) ** 2 for x in (r, a, g, f))
-
-    def correlate(spectra: np.ndarray) -> np.ndarray:
-        """Sums of products over all lags, rows from those of their spectra; half a spectrum is a real signal's."""
-        out = np.fft.ifft(spectra) if spectra.shape[1] == size else np.fft.irfft(spectra, size)
-        return np.concatenate((out[:, size - len(weight) + 1 :], out[:, : len(there)]), 1)
-
-    W, R, R2, A2 = np.fft.rfft((weight, r, r2, a2), size).conj()
-    M, G, G2, F2 = np.fft.rfft((there, g, g2, f2), size)
-    n, *real = correlate(np.stack((W * M, R * M, W * G, R * G, R2 * M, W * G2, A2 * M, W * F2)))
-    W, A = np.fft.fft((weight, a), size).conj()
-    M, F = np.fft.fft((there, f), size)
-    count, n = np.round(np.maximum(n, 1e-9)), np.maximum(n, 1.0)
-    mean_r, mean_g, rg, mean_r2, mean_g2, mean_a2, mean_f2 = (x / n for x in real)
-    mean_a, mean_f, af = correlate(np.stack((A * M, W * F, A * F))) / n
-
-    def spread(mean: np.ndarray, mean2: Floats, least: float) -> Floats:
-        return np.maximum(mean2 - np.abs(mean) ** 2, least)
-
-    least_r, least_a = (1e-3 * max(float(x.sum()), 1e-9) / max(float(weight.sum()), 1.0) for x in (r2, a2))
-    yaws = (rg - mean_r * mean_g) / np.sqrt(spread(mean_r, mean_r2, least_r) * spread(mean_g, mean_g2, 1e-4))
-    alike = (af - mean_a * mean_f) / np.sqrt(spread(mean_a, mean_a2, least_a) * spread(mean_f, mean_f2, 1e-4))
-    yaws = np.clip(yaws, -0.9999, 0.9999)
-    forces = np.clip(np.abs(alike), 0.0, 0.9999)
-    gain = -0.5 * n * np.log1p(-(np.maximum(yaws, 0.0) ** 2)) - n * np.log1p(-(forces**2))
-    return np.where(count > 3, gain, 0.0), yaws, forces, -np.angle(alike), count
+    size = next_fast_len(len(a) + len(b) - 1, real=True)
+    forward, back = (np.fft.fft, np.fft.ifft) if np.iscomplexobj(a) else (np.fft.rfft, np.fft.irfft)
+    a, b = (there * (x - (there @ x) / max(there.sum(), 1.0)) for x, there in ((a, a_there), (b, b_there)))
+    a2, b2 = (np.abs(x) ** 2 for x in (a, b))
+    one, first, square = forward((a_there, a, a2), size).conj()
+    other, second, power = forward((b_there, b, b2), size)
+    sums = back((one * other, first * other, one * second, first * second, square * other, one * power), size)
+    count, *sums = np.concatenate((sums[:, size - len(a) + 1 :], sums[:, : len(b)]), 1)
+    count = np.maximum(np.round(count.real), 1.0)
+    mean_a, mean_b, product, square, power = (x / count for x in sums)
+    spreads = (square.real - np.abs(mean_a) ** 2, power.real - np.abs(mean_b) ** 2)
+    least = (LEAST_VARIANCE * float(x.sum()) / max(float(n.sum()), 1.0) for x, n in ((a2, a_there), (b2, b_there)))
+    spread_a, spread_b = (np.maximum(x, max(floor, 1e-12)) for x, floor in zip(spreads, least))
+    return (product - mean_a * mean_b) / np.sqrt(spread_a * spread_b), count

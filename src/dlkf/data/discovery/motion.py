@@ -94,15 +94,10 @@ def _stride(t: Floats) -> int:
     return max(1, int(np.ceil(SHORTEST_STEP_S / max(step, 1e-3) - 0.01)))
 
 
-def _thin_rows(t: Floats, good: NDArray[np.bool_]) -> NDArray[np.int64]:
-    rows = np.flatnonzero(good)
-    return rows[:: _stride(t[rows])]
-
-
 def _from_positions(t: Floats, lat_deg: Floats, lon_deg: Floats) -> Motion:
     """Velocity between two fixes, at the middle of their interval."""
-    rows = _thin_rows(t, np.isfinite(t))
-    t, moved = t[rows], displacements(lat_deg[rows], lon_deg[rows])
+    thin = slice(None, None, _stride(t))
+    t, moved = t[thin], displacements(lat_deg[thin], lon_deg[thin])
     step = np.diff(t)
     fine = (step > 0) & (step <= LONGEST_STEP_S)
     middle = 0.5 * (t[1:] + t[:-1])[fine]
@@ -135,8 +130,9 @@ def position_delay(fixes: Columns | pd.DataFrame) -> tuple[float, float]:
     Δp − ∫v dt = −δ Δv: what a turn or a braking car leaves between them.
     """
     north, east, lat_deg, lon_deg = (np.asarray(fixes[c]) for c in (*VELOCITY[:2], "lat_deg", "lon_deg"))
-    rows = _thin_rows(np.asarray(fixes["t"]), np.isfinite(north + east + lat_deg + lon_deg))
-    t, v = np.asarray(fixes["t"])[rows], north[rows] + 1j * east[rows]
+    stamps, known = np.asarray(fixes["t"]), np.flatnonzero(np.isfinite(north + east + lat_deg + lon_deg))
+    rows = known[:: _stride(stamps[known])]
+    t, v = stamps[rows], north[rows] + 1j * east[rows]
     step = np.diff(t)
     fine = (step > 0) & (step < LONGEST_STEP_S)
     # the mean radius is good to 0.3 %: what it spoils is a share of the way, so it is fitted beside the delay

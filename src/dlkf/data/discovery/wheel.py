@@ -1,9 +1,9 @@
 """Unit and clock offset of a wheel speed, from the speed of GNSS.
 
-Both speeds lie on a grid of half a second and are correlated over all lags at which the logs overlap, by FFT
-(normalised correlation with masks, Padfield 2012); then the offset between the steps is that of the least sum of
-squares of scale · wheel(t − lag) − GNSS(t), without outliers (slip, damaged speeds) and where the wheel has samples
-near, its 1σ from the residuals over the accelerations: σ² = s² / Σ (dv/dt)².
+Both speeds lie on a grid of half a second and are correlated over all lags at which the logs overlap; then the offset
+between the steps is that of the least sum of squares of scale · wheel(t − lag) − GNSS(t), without outliers (slip,
+damaged speeds) and where the wheel has samples near, its 1σ from the residuals over the accelerations:
+σ² = s² / Σ (dv/dt)².
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dlkf.data.discovery.clock import find_peak
+from dlkf.data.discovery.clock import correlate, find_peak
 from dlkf.data.discovery.motion import Floats, Motion
 
 STEP_S = 0.5
@@ -50,7 +50,7 @@ def find_wheel(t: Floats, speed: Floats, gnss: Motion) -> Wheel | None:
         return None
     wheel, here = _resample(t, speed)
     ground, there = _resample(gnss.t, gnss.speed)
-    alike, count = _correlations(wheel, here, ground, there)
+    alike, count = correlate(wheel, here, ground, there)
     lags = (np.arange(len(alike)) - (len(wheel) - 1)) * STEP_S + gnss.t[0] - t[0]
     allowed = count * STEP_S >= min(LEAST_S, 0.5 * min(np.ptp(t), np.ptp(gnss.t)))
     if not allowed.any():
@@ -73,25 +73,6 @@ def _is_near(t: Floats, at: Floats) -> np.ndarray:
     after = np.clip(np.searchsorted(t, at), 0, len(t) - 1)
     apart = np.maximum(np.abs(t[after] - at), np.abs(at - t[np.maximum(after - 1, 0)]))
     return apart <= max(2 * float(np.median(np.diff(t))), STEP_S)
-
-
-def _correlations(a: Floats, a_there: Floats, b: Floats, b_there: Floats) -> tuple[Floats, Floats]:
-    """Normalised correlation of b with a, which begins ``k − (len(a) − 1)`` steps after b does, and the overlap."""
-    from scipy import fft
-
-    size = fft.next_fast_len(len(a) + len(b) - 1)
-
-    def correlate(x: Floats, y: Floats) -> Floats:
-        out = fft.irfft(np.conj(fft.rfft(x, size)) * fft.rfft(y, size), size)
-        return np.concatenate((out[size - len(a) + 1 :], out[: len(b)]))
-
-    a, b = (a - np.average(a, weights=a_there)) * a_there, (b - np.average(b, weights=b_there)) * b_there
-    count = np.maximum(np.round(correlate(a_there, b_there)), 1.0)
-    mean_a, mean_b = correlate(a, b_there) / count, correlate(a_there, b) / count
-    covariance = correlate(a, b) / count - mean_a * mean_b
-    power = [correlate(a * a, b_there) / count - mean_a**2, correlate(a_there, b * b) / count - mean_b**2]
-    least = [1e-3 * float((x * x).mean()) + 1e-12 for x in (a, b)]
-    return covariance / np.sqrt(np.maximum(power[0], least[0]) * np.maximum(power[1], least[1])), count
 
 
 def _between(t: Floats, speed: Floats, gnss: Motion, lag_s: float, clear: bool) -> Wheel | None:

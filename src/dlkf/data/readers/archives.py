@@ -53,5 +53,9 @@ def drive_places(source: Path) -> list[Path]:
 
 
 def drive_name(path: Path) -> str:
-    """Of a folder its name, of an archive its name without .zip."""
-    return path.stem if path.suffix.lower() == ".zip" and not path.is_dir() else path.name
+    """Of a folder its name, of a .zip that without its ending, of any other file what stands before the first point; of
+    a ROS 2 bag's metadata.yaml the name of the bag's folder."""
+    path = (path.parent if path.name == "metadata.yaml" else path).absolute()
+    if path.is_dir():
+        return path.name
+    return path.stem if path.suffix.lower() == ".zip" else path.name.partition(".")[0]

@@ -73,18 +73,14 @@ class AutoReader:
     def places(self, source: str | Path) -> list[Place]:
         """Where the drives lie, for :meth:`drive_at`."""
         source = Path(source)
-        if is_archive(source):
-            return [(source, self.drive or drive_name(source), None)]
-        if source.is_file():
-            source, only = source.parent, _find_bag(source)
-        else:
-            only = None
-        if not source.is_dir():
+        if source.is_file() and not is_archive(source):
+            only = _find_bag(source)
+            return [(only.parent, self.drive or drive_name(only), only)]
+        if not source.exists():
             raise InputError(f"source={source}: no such file or folder; it holds one drive, or one subfolder per drive")
-        within = None if only is not None else _recognise_files(source, self.known)
-        if within is None or any(one.offers for one in within):
-            named = source.absolute() if only is None or only.name == "metadata.yaml" else only
-            return [(source, self.drive or named.name.partition(".")[0], only)]
+        within = [] if source.is_file() else _recognise_files(source, self.known)
+        if source.is_file() or any(one.offers for one in within):
+            return [(source, self.drive or drive_name(source), None)]
         if not (places := drive_places(source)):
             raise InputError(
                 f"source={source}: holds no log that can be recognised{_describe_files(within)}; name a reader and "

@@ -98,15 +98,13 @@ class LogReader:
     def places(self, source: str | Path) -> list[Place]:
         """Where the drives lie, for :meth:`drive_at`."""
         source = Path(source)
-        if is_archive(source):
-            return [(source, self.drive or drive_name(source), None)]
-        if source.is_file():
-            return [(source.parent, self.drive or source.name.partition(".")[0], source)]
-        if not source.is_dir():
-            raise InputError(f"source={source}: no such file or folder; it holds one drive, or one subfolder per drive")
         patterns = self.specs["imu"].get("file")
-        if _match_files(source, patterns):
-            return [(source, self.drive or source.absolute().name, None)]
+        if source.is_file() and not is_archive(source):
+            return [(source.parent, self.drive or drive_name(source), source)]
+        if not source.exists():
+            raise InputError(f"source={source}: no such file or folder; it holds one drive, or one subfolder per drive")
+        if source.is_file() or _match_files(source, patterns):
+            return [(source, self.drive or drive_name(source), None)]
         if not (places := drive_places(source)):
             named = _name_patterns(patterns)
             raise InputError(f"source={source}: no file {named} and no subfolders; set reader.imu.file")

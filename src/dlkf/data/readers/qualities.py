@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from dlkf.base.errors import list_some
 from dlkf.data.readers import vocabulary
 from dlkf.data.schema import QUALITIES
 
@@ -50,15 +51,15 @@ def quality_spec(frame: pd.DataFrame, column: str | None, accuracy_m: float) -> 
     values = frame[column]
     if not any(str(word).strip() for word in values.dropna().unique()):
         return None, [f"quality {column} is empty: all count as single"]
-    numbers = pd.to_numeric(values, errors="coerce")
+    numbers, held = pd.to_numeric(values, errors="coerce"), list_some([str(x) for x in values.dropna().unique()], 4)
     if not bool(numbers.notna().any()):
         words = _read_words(values, column)
-        unknown = f"quality {column} has words that are not known ({_list_some(values)}): all count as single; map them"
+        unknown = f"quality {column} has words that are not known ({held}): all count as single; map them"
         return words, [] if words else [f"{unknown} with reader.gnss.quality={{column: {column}, map: {{…: 4}}}}"]
     seen = sorted({float(x) for x in numbers.dropna()})
     fits = [name for name, map_ in READINGS.items() if all(x in map_ for x in seen)]
     if not fits:
-        unknown = f"quality {column} has numbers that no receiver gives ({_list_some(values)}): all count as single"
+        unknown = f"quality {column} has numbers that no receiver gives ({held}): all count as single"
         return None, [unknown]
     beside_hdop = vocabulary.find_column([str(c) for c in frame.columns], "hdop") is not None  # RTKLIB writes none
     unlikely = {RTKLIB: beside_hdop, GGA: 3 in seen}  # PPS is rare, 3D is not
@@ -128,7 +129,3 @@ def _code(word: str) -> int | None:
 
 def _describe_codes(codes: Mapping[int, int]) -> str:
     return ", ".join(f"{x} is {QUALITIES[code]}" for x, code in codes.items())
-
-
-def _list_some(values: pd.Series) -> str:
-    return ", ".join(str(x) for x in values.dropna().unique()[:4])

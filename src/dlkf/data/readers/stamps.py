@@ -25,6 +25,7 @@ NAMED_ZONE = r"(?:Z|UTC|GMT|[+-]\d{2}:?\d{2})\s*$"
 QUARTER_S, LEAST_ZONE_S = 900, 3600  # time zones are whole quarters of an hour
 SWITCHED_ON_S = 1000.0  # a log that begins with less counts from its own beginning, which is nothing to report
 XSENS_TICK = "1e-4s"
+CLOCK_NAMES = {"gps": "GPS time", None: "of an unnamed clock"}  # of calendar texts; else UTC
 OLDEST_UNIX = 1.0e9  # s: 2001; no log of a car with an IMU of this kind is older
 
 
@@ -161,55 +162,61 @@ def local_time_s(gnss: Mapped, imu: Mapped) -> int:
 def epoch_note(part: Mapped) -> str | None:
     """From when the stamps of a table of numbers are taken to count, and what else they may mean; None for dates and
     for formats that state it themselves."""
-    time = part.time
     if part.spec.get("format") not in TABULAR or not len(part):
         return None
-    setting = f"reader.{part.kind}.time"
-    column = time.get("column")
-    what = f"stamps of {part.table.path.name} ({', '.join(map(str, column)) if isinstance(column, list) else column})"
-    clock = time.get("clock")
+    column, week = part.time.get("column"), part.time.get("week")
+    columns = [str(c) for c in (column if isinstance(column, list) else [column])]
+    said = _describe_epoch(part, columns, f"reader.{part.kind}.time")
+    names = ", ".join([*columns, *([] if week is None else [str(week)])])
+    return None if said is None else f"stamps of {part.table.path.name} ({names}): {said}"
+
+
+def _describe_epoch(part: Mapped, columns: list[str], setting: str) -> str | None:
+    """What the stamps in these columns are taken for; None where there is nothing to be said."""
+    time = part.time
+    unit = time.get("unit") or "s"
     if (time.get("week") is not None or time.get("week_number") is not None) and (first := part.first_gps_s()):
-        what = f"{what[:-1]}, {time['week']})" if time.get("week") is not None else what
         day = _day(first + units.GPS_EPOCH_UNIX)
-        return f"{what}: taken as week {int(first // units.WEEK_S)} of GPS and seconds of it, of {day}"
-    if (unit := time.get("unit")) in units.DAYS:
-        first = units.DAY_S * (float(part.column(str(column), nan=False)[0]) - units.DAYS[unit])
+        return f"taken as week {int(first // units.WEEK_S)} of GPS and seconds of it, of {day}"
+    if unit in units.DAYS:
+        first = units.DAY_S * (float(part.column(columns[0], nan=False)[0]) - units.DAYS[unit])
         name = {"datenum": "MATLAB's datenum", "excel": "a spreadsheet's dates"}[unit]
-        return f"{what}: days, taken as {name} in UTC, of {_day(first)}"
-    if time.get("unit") == units.HHMMSS and isinstance(column, list):
-        day = units.day_of_number(part.table.frame[column[0]].iloc[0])
-        return f"{what}: taken as hours, minutes and seconds (hhmmss) in UTC, from {day} on"
-    if time.get("unit") == units.HHMMSS:
-        return f"{what}: taken as hours, minutes and seconds (hhmmss), which have no date; {setting}.day=… gives it"
-    single = time.get("unit") == units.ISO and not isinstance(column, list)
-    if single and bool(part.texts(str(column)).str.match(units.OF_DAY).all()):
-        undated = f"{what}: times of day, which have no date; {setting}.day=2025-07-05 gives it"
-        return None if time.get("day") else undated
-    if time.get("unit") == units.ISO:
-        as_what = {"gps": "GPS time", None: "of an unnamed clock"}.get(clock, "UTC")
+        return f"days, taken as {name} in UTC, of {_day(first)}"
+    if unit == units.HHMMSS:
+        if len(columns) == 1:
+            return f"taken as hours, minutes and seconds (hhmmss), which have no date; {setting}.day=… gives it"
+        day = units.day_of_number(part.table.frame[columns[0]].iloc[0])
+        return f"taken as hours, minutes and seconds (hhmmss) in UTC, from {day} on"
+    if unit == units.ISO:
+        texts = part.texts(columns[0])
+        if len(columns) == 1 and bool(texts.str.match(units.OF_DAY).all()):
+            undated = f"times of day, which have no date; {setting}.day=2025-07-05 gives it"
+            return None if time.get("day") else undated
         other = ""
-        if order := time.get("order"):
+        if (order := time.get("order")) and units.day_order(texts) == "":
             swapped = {"dmy": "mdy", "mdy": "dmy"}.get(order)
             other = f", {'day' if order == 'dmy' else 'month'} first; {setting}.order={swapped} is the other reading"
-        texts = part.texts(str(column[0] if isinstance(column, list) else column))
-        return f"{what}: dates taken as {as_what}{other if units.day_order(texts) == '' else ''}"
-    if time.get("day") is not None:
-        return None
-    seconds = float(part.column(str(column), nan=False)[0]) / units.TIME[time.get("unit") or "s"]
+        return f"dates taken as {CLOCK_NAMES.get(time.get('clock'), 'UTC')}{other}"
+    return None if time.get("day") is not None else _describe_count(part, columns[-1], setting)
+
+
+def _describe_count(part: Mapped, column: str, setting: str) -> str | None:
+    """From when seconds in a column count, by their size."""
+    unit, clock = part.time.get("unit") or "s", part.time.get("clock")
+    seconds = float(part.column(column, nan=False)[0]) / units.TIME[unit]
     known = {"unix": "unix", "utc": "unix", "gps": "gps"}.get(str(clock)) or units.clock_by_size(seconds)
-    dates = _dates(seconds)
     if known is None:
-        counter = time.get("unit") == XSENS_TICK  # runs since the device was switched on
+        counter = unit == XSENS_TICK  # runs since the device was switched on
         if part.kind != "gnss" or counter or not SWITCHED_ON_S < seconds < units.WEEK_S:
             return None
-        if seconds < units.DAY_S and not vocabulary.has(str(column), r"\b(?:tow|sow|itow|week)\b"):
+        if seconds < units.DAY_S and not vocabulary.has(column, r"\b(?:tow|sow|itow|week)\b"):
             return (
-                f"{what}: seconds of a day or of a GPS week, which have no date; {setting}.day=2025-07-05 or "
+                f"seconds of a day or of a GPS week, which have no date; {setting}.day=2025-07-05 or "
                 f"{setting}.week_number=… gives it"
             )
-        return f"{what}: seconds of a GPS week, it seems, which have no date; {setting}.week_number=… gives the week"
+        return f"seconds of a GPS week, it seems, which have no date; {setting}.week_number=… gives the week"
     names = {"unix": "Unix time (since 1970)", "gps": "GPS seconds since 1980"}
-    other = "gps" if known == "unix" else "unix"
+    other, dates = "gps" if known == "unix" else "unix", _dates(seconds)
     first = _day(seconds + (units.GPS_EPOCH_UNIX if known == "gps" else 0))
     also = f"; as {names[other]} they would be of {dates[other]}: {setting}.clock={other}" if dates[other] else ""
-    return f"{what}: taken as {names[known]}, of {first}{also}"
+    return f"taken as {names[known]}, of {first}{also}"

@@ -132,7 +132,7 @@ def aid_columns(model: Any) -> tuple[str, ...]:
 
 
 def unmeasured_value(column: str) -> float | None:
-    """What one of :func:`aid_columns` says of an update interval without a measurement; None: an estimate, which stays."""
+    """What one of :func:`aid_columns` says of an interval without a measurement; None: an estimate, which stays."""
     if column.endswith(("_innovation", "_innovation_std")):
         return math.nan
     return 0.0 if column.endswith("_used") else None
