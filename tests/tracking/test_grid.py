@@ -269,7 +269,7 @@ def swept(folder: Path, client, *launcher: str, **environment: str) -> None:
     parent = runs["grid x 1,2,3"].info.run_id
     assert all(r.data.tags["mlflow.parentRunId"] == parent for n, r in runs.items() if n != "grid x 1,2,3")
     assert all(len(client.get_metric_history(runs[f"x={k}"].info.run_id, "train/loss")) == 20 for k in (1, 2, 3))
-    assert "position_rms_m" in done.stdout and parent in done.stdout
+    assert "Position error, RMS [m]" in done.stdout and parent in done.stdout
 
 
 @pytest.mark.commands
