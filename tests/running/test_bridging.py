@@ -14,7 +14,17 @@ from dlkf.filters.build import build_filter
 from dlkf.navigation.earth import tangent_frame
 from dlkf.navigation.state import ATTITUDE, POSITION, VELOCITY, NavState
 from dlkf.navigation.strapdown import strapdown
-from dlkf.running.bridging import LONGEST_BRIDGE_S, Stretch, bridge, can_bridge, fill_gap
+from dlkf.running.bridging import (
+    CORRELATION,
+    LONGEST_BRIDGE_S,
+    OF_POSITION,
+    SAMPLES_ATTITUDE_STD,
+    SAMPLES_VELOCITY_STD,
+    Stretch,
+    bridge,
+    can_bridge,
+    fill_gap,
+)
 from dlkf.running.replay import replay_drive
 from dlkf.running.start import align_drives
 from dlkf.running.streaming import Status, StreamingFilter
@@ -91,8 +101,16 @@ def test_covariance_of_a_stretch_grows_with_the_gap_and_stays_one():
         assert torch.equal(P[9:, 9:], like[0, 9:, 9:])
         assert float(P.trace()) > before
         before = float(P.trace())
-    std = P.diagonal().sqrt()  # after the longest gap: 0.2·3^1.5 = 1.04 m/s level, 1°·3² = 9° in yaw
-    assert 1.0 < std[VELOCITY][0] < 1.2 and 8 < np.degrees(std[ATTITUDE][2]) < 10 and 1.5 < std[POSITION][0] < 2.5
+    # closed form after the longest gap, with the specific force g up: P at the start over 4 s, what the gap adds, 0.6 s
+    T, after, span, g = LONGEST_BRIDGE_S, 0.6, LONGEST_BRIDGE_S + 1, float(frame.gravity(z)[0, 2])
+    level, tilt = (0.2 * T**1.5) ** 2, np.radians(0.6) ** 2 * T + SAMPLES_ATTITUDE_STD**2 * span
+    arm, samples = OF_POSITION * T, SAMPLES_VELOCITY_STD**2 * span
+    yaw = 1e-4 + np.radians(T**2) ** 2 + SAMPLES_ATTITUDE_STD**2 * span
+    velocity = 1e-4 * (1 + (g * span) ** 2) + level + samples + tilt * (g * after) ** 2
+    position = 1e-4 * (1 + span**2 + (g * span**2 / 2) ** 2) + level * (arm**2 + 2 * after * CORRELATION * arm)
+    position += after**2 * (level + samples) + tilt * (g * after**2 / 2) ** 2
+    found = P.diagonal()[[POSITION.start, VELOCITY.start, ATTITUDE.start + 2]]
+    np.testing.assert_allclose(found, [position, velocity, yaw], rtol=1e-9)
 
 
 @pytest.mark.parametrize("name", FILTERS)
