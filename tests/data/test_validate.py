@@ -97,9 +97,12 @@ def _feet(height: np.ndarray) -> np.ndarray:
 
 def _look_back(tables: Tables) -> Tables:
     """The sensor's x points back, and so does the heading of its reference: also a car in reverse all the time."""
-    imu = tables["imu"].copy()
-    imu[["accel_x", "accel_y", "gyro_x", "gyro_y"]] *= -1
-    return {**_set("reference", "yaw", lambda y: y + np.pi)(tables), "imu": imu}
+    return _rows("imu", _half_turn)(_set("reference", "yaw", lambda y: y + np.pi)(tables))
+
+
+def _half_turn(frame: pd.DataFrame) -> pd.DataFrame:
+    """The sensor's x points back."""
+    return frame.assign(**{name: -frame[name] for name in ("accel_x", "accel_y", "gyro_x", "gyro_y")})
 
 
 GYRO, ACCEL = ["gyro_x", "gyro_y", "gyro_z"], ["accel_x", "accel_y", "accel_z"]
@@ -173,6 +176,7 @@ BAD = {
     "yaw of the right": (_set("reference", "yaw", lambda y: y + np.pi / 2), r"\+90° from the course.*subtract 1.57"),
     "yaw of the left": (_set("reference", "yaw", lambda y: y - np.pi / 2), "-90° from the course.*add 1.57"),
     "yaw of the back": (_set("reference", "yaw", lambda y: y + np.pi), "yaw is 180° from the course"),
+    "an IMU that looks back": (_rows("imu", _half_turn), "yaw is along the course, but the IMU looks back: .*yaw: 180"),
     "a second late": (_set("reference", "t", lambda t: t + 1), "1.0 s ahead of that of GNSS; subtract 1.0 s from t"),
     "leap seconds early": (_set("reference", "t", lambda t: t - 18), "18.0 s behind.*leap seconds.*add 18.0 s to t"),
     "above the geoid": (_set("reference", "height_m", lambda h: h - 47), "47 m below the fixes.*geoid.*position.geoid"),

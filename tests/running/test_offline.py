@@ -6,6 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from dlkf.base.angles import wrap_angle
 from dlkf.data.schema import ACCEL, GYRO, POSITION, STD, VELOCITY, write_drive
 from dlkf.filters.build import build_filter
 from dlkf.filters.saved import choose_grid
@@ -85,6 +86,24 @@ def test_the_summary_counts_the_fixes_of_the_file():
     result = replace(late.result, aligned_at=9.0, table=late.result.table[10:])
     said = result.summary(late.fixes)
     assert "solution from t = 10.0 s, none for the 10 fixes before, 1190 epochs, 1149 of 1200 fixes used" in said
+
+
+def test_the_summary_says_where_the_car_goes_in_the_axes_of_its_imu():
+    """Of an IMU that is turned about the vertical; not of a course that only scatters, nor of slow rows."""
+    result = driven(0).result
+    yaw = np.linspace(0, 20, len(result.table))
+
+    def said(angle: float | np.ndarray, speed: float = 12.0) -> str:
+        course = yaw + np.radians(angle)
+        moving = {"vel_n": speed * np.cos(course), "vel_e": speed * np.sin(course), "yaw": wrap_angle(yaw)}
+        return replace(result, table=result.table.assign(**moving)).summary()
+
+    assert "25° to the right of the IMU's x axis (dlkf doctor" in said(25.0)
+    assert "12° to the left of the IMU's x axis" in said(-12.0)
+    assert "backwards all the way" in said(175.0) and "x axis" not in said(175.0)
+    scattered = np.random.default_rng(0).normal(0, 60, len(yaw)) + 15
+    for angle, speed in ((8.0, 12.0), (25.0, 3.0), (scattered, 12.0)):
+        assert "x axis" not in said(angle, speed)
 
 
 def test_a_sensor_that_made_no_update_is_said_to_have_made_none_but_vibration_which_needs_none():

@@ -130,11 +130,19 @@ def check_attitude(reference: Columns, imu: Columns, where: str) -> None:
     if measure_distance(yaw) > 0.5 and measure_distance(np.pi / 2 - yaw) < 0.1:
         raise InputError(f"{where}: yaw counts from East, must count clockwise from North; use π/2 − yaw")
     turned, off = circular_median(yaw - course)
-    if np.mean(np.abs(off) < SIDEWAYS) < STEADY or abs(turned) < np.radians(TURNED_DEG[0]):
+    if np.mean(np.abs(off) < SIDEWAYS) < STEADY:
         return
     backwards = abs(turned) > np.radians(TURNED_DEG[1])
-    if backwards and not _looks_forward(imu, reference):
-        return  # a car in reverse, or a sensor that looks back
+    if backwards or abs(turned) < np.radians(TURNED_DEG[0]):
+        looks_back = _looks_back(imu, reference)
+        if looks_back is None or looks_back == backwards:
+            return  # forward, or a car in reverse, or a sensor that looks back
+        if looks_back:
+            raise InputError(
+                f"{where}: yaw is along the course, but the IMU looks back: its accelerations agree with the motion if "
+                "it is turned by 180° about the vertical; both must be of the same axes, x forward: "
+                "reader.imu.accel.axes and gyro.axes={roll: 0, pitch: 0, yaw: 180}"
+            )
     by = "180" if backwards else f"{np.degrees(turned):+.0f}"
     change = f"{'subtract' if turned > 0 else 'add'} {abs(turned):.2f} rad"
     raise InputError(
@@ -144,9 +152,11 @@ def check_attitude(reference: Columns, imu: Columns, where: str) -> None:
     )
 
 
-def _looks_forward(imu: Columns, reference: Columns) -> bool:
-    """Whether the force along the sensor's x axis is that of a motion along it."""
+def _looks_back(imu: Columns, reference: Columns) -> bool | None:
+    """Whether the force along the sensor's x axis is against a motion along it; None where it is not clear."""
     whole = np.unique(np.floor(reference["t"]), return_index=True)[1]  # one row a second
     moved = find_motion({name: values[whole] for name, values in reference.items()})
     best = find_lag(ImuSums.of_table(imu), moved, APART_S)
-    return best is not None and best.force > FORCE_AGREES and abs(best.angle) < np.radians(TURNED_DEG[0])
+    if best is None or best.force < FORCE_AGREES or TURNED_DEG[0] < np.degrees(abs(best.angle)) < TURNED_DEG[1]:
+        return None
+    return bool(abs(best.angle) > np.pi / 2)

@@ -13,6 +13,7 @@ import numpy as np
 import pandas as pd
 import torch
 
+from dlkf.base.angles import circular_median, wrap_angle
 from dlkf.base.console import ProgressCallback
 from dlkf.base.errors import InputError, no_drives
 from dlkf.data.alignment import SEARCH, AlignConfig, Start
@@ -42,6 +43,7 @@ SIGMAS = 3.0  # what differs from what a log says by so many 1σ is worth saying
 OF_RECEIVER = {DELAY: 0.01, **dict.fromkeys(ARM, 0.1), DRIFT: 30.0}  # s, m, ppm: 1σ of what no model of a car contains
 SAMPLES_AT_ONCE = CHUNK_SAMPLES  # IMU samples of drives in memory, 8 h at 50 Hz
 FASTER_THAN_REVERSE = 8.0  # m/s
+ASKEW = math.radians(10.0)  # between course and heading; the constraints' mounting angles are expected to be smaller
 VIBRATION = "vibration_speed"
 MOSTLY = 0.5  # of the updates of a further sensor; where fewer are used, its numbers are likely wrong
 
@@ -102,12 +104,20 @@ def choose_epoch(spacings: Iterable[UsableFixes], rate_hz: float, estimator: Fil
     return closest if closest < 1.0 and whole and not constrained else 1.0
 
 
-def _drives_backwards(table: pd.DataFrame) -> bool:
-    """Whether a car that moves faster than a reversing one faces the way that it came from, in nearly all rows."""
+def _describe_mounting(table: pd.DataFrame) -> str:
+    """Where a car that moves faster than a reversing one goes in the axes of its IMU, unless that is forward."""
     north, east, yaw = (table[column].to_numpy(float) for column in ("vel_n", "vel_e", "yaw"))
     fast = np.hypot(north, east) > FASTER_THAN_REVERSE
-    along = np.cos(yaw) * north + np.sin(yaw) * east
-    return bool(fast.any()) and float(np.mean(along[fast] < 0)) > 0.9
+    if not fast.any():
+        return ""
+    course = wrap_angle(np.arctan2(east, north) - yaw)[fast]
+    if np.mean(np.abs(course) > np.pi / 2) > 0.9:
+        return "backwards all the way (an IMU mounted the other way round?), "
+    turned, off = circular_median(course)
+    if abs(turned) < ASKEW or np.mean(np.abs(off) < ASKEW) < 0.9:
+        return ""
+    side = "right" if turned > 0 else "left"
+    return f"{np.degrees(abs(turned)):.0f}° to the {side} of the IMU's x axis (dlkf doctor measures its mounting), "
 
 
 @dataclass(frozen=True)
@@ -132,8 +142,7 @@ class Navigated:
         if self.doubt > WORTH_SAYING:
             text += f"heading ambiguous (the alternatives have probability {self.doubt:.2g}), "
         text += f"{len(self.table)} epochs, "
-        if _drives_backwards(self.table):
-            text += "backwards all the way (an IMU mounted the other way round?), "
+        text += _describe_mounting(self.table)
         if spacing is None:
             text += f"{used} fixes used"
         else:
