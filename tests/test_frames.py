@@ -48,6 +48,28 @@ def test_navigate_gives_the_command_s_solution(drive, call):
     assert len(solution.map().data) and type(solution[solution.t > 10]) is pd.DataFrame
 
 
+def test_a_prior_is_where_the_filter_begins(drive, call):
+    """In a solution, a stream and an evaluation: the calibration of the unit, as the command takes it."""
+    prior = {"mean": [0.02, -0.03, 0.01, 1e-3, -1e-3, 5e-4], "std": np.full(6, 1e-4)}
+    words = [f"prior.{name}=[{','.join(map(str, values))}]" for name, values in prior.items()]
+    dataset = f"dataset={drive['folder']}"
+    done = call("navigate", "model=mbkf15_prior", dataset, "out=solved", "skip_unaligned=true", *words)
+    assert done.code == 0, done.err
+    expected = pd.read_parquet(f"solved/drive={drive['name']}/solution.parquet").drop(columns="geometry")
+    row = pd.read_parquet(drive["folder"] / "drives.parquet").iloc[0]
+    arm = row[["lever_arm_x_m", "lever_arm_y_m", "lever_arm_z_m"]].astype(float).tolist()
+    given = {"imu": drive["imu"], "gnss": drive["gnss"], "lever_arm": arm, "prior": prior}
+    with pytest.warns(UserWarning, match="overconfident"):  # this IMU has no such biases
+        solution = dlkf.navigate(model="mbkf15_prior", **given)
+    pd.testing.assert_frame_equal(pd.DataFrame(solution), expected, check_exact=True)
+    assert solution.accel_error_y.iloc[0] == pytest.approx(-0.03, abs=1e-3)
+    report = dlkf.evaluate(reference=drive["reference"], models=["mbkf15", "mbkf15_prior"], outage_s=10, **given)
+    assert report.table.end_rms_m.nunique() == 2
+    assert dlkf.Stream("mbkf15_prior", rate_hz=50, prior=prior)
+    done = call("navigate", "model=mbkf15", dataset, "out=none", *words)
+    assert done.code == 2 and "a prior has no effect on mbkf15; filters with _prior take one" in done.err
+
+
 def test_numbers_of_other_types_and_columns_of_other_names(drive):
     """Objects, categories, a quality that is not known in some rows; names that are close are said to be unused."""
     imu, gnss = drive["imu"].astype({"accel_x": object, "gyro_x": "category"}), drive["gnss"]

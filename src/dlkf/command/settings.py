@@ -13,6 +13,7 @@ from typing import Any, Literal
 
 from dlkf.base.errors import InputError
 from dlkf.data.alignment import AlignConfig
+from dlkf.filters.build import check_prior_taken
 from dlkf.filters.tuning import Prior, Tuning
 from dlkf.navigation.imu_errors import ImuSpec, imu_spec
 
@@ -50,7 +51,10 @@ class FilterSettings:
     def filter_options(self) -> dict[str, Any]:
         """For :func:`dlkf.tracking.models.resolve_model`, beside the preset."""
         mean, std = self.prior.mean, self.prior.std
-        return {"tuning": self.tuning, "prior": None if mean is None or std is None else Prior(mean, std)}
+        prior = None if mean is None or std is None else Prior(mean, std)
+        if prior is not None:
+            check_prior_taken(self.models)
+        return {"tuning": self.tuning, "prior": prior}
 
     @property
     def spec(self) -> ImuSpec:

@@ -8,7 +8,7 @@ A sensor stands behind a plus, as in ``mbkf15+speed``, as do ``vibration_speed``
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from dlkf.base.classes import find_class
@@ -123,6 +123,12 @@ def build_filter(name: str, imu: ImuSpec, *, tuning: Tuning | None = None, prior
 def has_prior(name: str) -> bool:
     """Whether a filter of this name is given an IMU error before the drive."""
     return "prior" in FilterName.parse(name).endings
+
+
+def check_prior_taken(names: Sequence[str]) -> None:
+    """InputError where no filter of these names takes a prior that is given."""
+    if not any(is_filter(name) and has_prior(name) for name in names):
+        raise InputError(f"a prior has no effect on {', '.join(names)}; filters with _prior take one (mbkf15_prior)")
 
 
 def build_causal(name: str, imu: ImuSpec, why: str, **given: Any) -> Estimator:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 
@@ -81,6 +82,12 @@ class Prior:
 
     mean: Sequence[float]
     std: Sequence[float]
+
+    def __post_init__(self) -> None:
+        if not all(math.isfinite(x) for x in self.mean):
+            raise InputError(f"prior.mean is {list(self.mean)}, must be finite")
+        if not all(0 < x < math.inf for x in self.std):
+            raise InputError(f"prior.std is {list(self.std)}, must be above 0 and finite")
 
     def scale_spread(self, biases: float, matrices: float = 1.0) -> Prior:
         """The same mean with the 1σ of biases and of sensor matrices times a factor each."""

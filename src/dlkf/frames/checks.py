@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from inspect import signature
 from numbers import Integral, Real
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
@@ -17,6 +17,9 @@ import pandas as pd
 from dlkf.base.config import preset_names, read_preset
 from dlkf.base.errors import InputError, did_you_mean
 from dlkf.data.limits import LEVER_ARM_M
+
+if TYPE_CHECKING:
+    from dlkf.filters.tuning import Prior
 
 LONGEST_SHOWN = 80  # letters of a wrong value in a line
 CODES = range(10)  # of NMEA's GGA sentence
@@ -310,6 +313,22 @@ def check_preset(group: str, name: Any, argument: str = "") -> None:
 def tuning_values(tuning: str | Mapping[str, Any]) -> Mapping[str, Any]:
     """The factors of a Kalman filter's noise: a preset of ``conf/tuning``, or such factors by name."""
     return _preset_values("tuning", tuning)
+
+
+def prior_values(prior: Mapping[str, Sequence[float]] | None) -> Prior | None:
+    """What is known of an IMU error before the drive."""
+    from dlkf.filters.tuning import Prior
+
+    if prior is None:
+        return None
+    fine = isinstance(prior, Mapping) and set(prior) == {"mean", "std"}
+    try:
+        numbers = {k: tuple(np.asarray(prior[k], float).reshape(-1).tolist()) for k in prior} if fine else None
+    except (TypeError, ValueError):
+        numbers = None
+    if numbers is None:
+        raise InputError(f"prior is {prior!r}, must be {{'mean': numbers, 'std': numbers}}")
+    return Prior(**numbers)
 
 
 def imu_values(imu_type: str | Mapping[str, Any]) -> Mapping[str, Any]:

@@ -25,12 +25,7 @@ IN_PYTHON = (  # what a line advises for logs on disk, and what it is for frames
     (r"; give smaller ones, or outage=null", "; give a smaller outage_s, or a longer drive"),
     (r" or give tracking\.uri=…", " or set MLFLOW_TRACKING_URI"),
     (r"^smoother=rts needs", "smoothed=True needs"),
-    (
-        r": give prior\.mean and prior\.std .*",
-        ", which only the commands take; give the name without _prior",
-    ),
-    (r", mbkf15_prior", ""),
-    (r"(endings of a Kalman filter: )_prior, ", r"\1"),
+    (r"give prior\.mean and prior\.std (\(.*\)) or let dlkf\.train find them", r"give prior={'mean': …, 'std': …} \1"),
     (r"outage\.first_s=60 and outage\.duration_s=", "60 s with GNSS first and outage_s="),
 )
 PLACE = re.compile(rf"drive {DRIVE}, (\w+)(/drive={DRIVE})?")

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
-from dlkf.frames.checks import check_above_zero, check_models, imu_values, tuning_values
+from dlkf.frames.checks import check_above_zero, check_models, imu_values, prior_values, tuning_values
 from dlkf.frames.dataset import drive_folder
 
 if TYPE_CHECKING:
@@ -85,6 +85,7 @@ def evaluate(
     outage_s: float = 30.0,
     imu_type: str | Mapping[str, Any] = "automotive_mems",
     tuning: str | Mapping[str, Any] = "untuned",
+    prior: Mapping[str, Sequence[float]] | None = None,
     lever_arm: Sequence[float] = (0.0, 0.0, 0.0),
     speed: pd.DataFrame | None = None,
     heading: pd.DataFrame | None = None,
@@ -103,7 +104,7 @@ def evaluate(
         Filters to compare, as ``model`` of :func:`dlkf.frames.navigation.navigate`.
     outage_s : float
         Length of an outage [s]; the next begins after as long with GNSS.
-    imu_type, tuning : str or mapping
+    imu_type, tuning, prior : str or mapping
         As in :func:`dlkf.frames.navigation.navigate`.
     lever_arm : sequence of 3 floats
         IMU → antenna, Forward-Right-Down [m].
@@ -129,13 +130,14 @@ def evaluate(
 
     names = check_models(models)
     check_above_zero(outage_s=outage_s)
-    noise = imu_values(imu_type)
+    noise, known = imu_values(imu_type), prior_values(prior)
     aids = {"speed": speed, "heading": heading, "baro": baro}
     with drive_folder(imu, gnss, reference, lever_arm, aids) as folder:
         values = compose_command("evaluate", "model=ins", f"outage.duration_s={float(outage_s)}", resolve=False)
         values |= {"model": names, "dataset": str(folder), "mode": "drives", "out": "", "injected_bias": None}
         values |= {"imu": noise, "reference": "smoothed" if reference is None else "file"}
         values["tuning"] = dict(tuning_values(tuning))
+        values["prior"] = {"mean": None, "std": None} if known is None else {"mean": known.mean, "std": known.std}
         values["tracking"] = {"uri": None, "log": False}
         values.pop("hydra", None)
         settings = settings_from(EvaluateSettings, values, "")

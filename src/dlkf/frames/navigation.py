@@ -18,6 +18,7 @@ from dlkf.frames.checks import (
     check_options,
     check_switch,
     imu_values,
+    prior_values,
     tuning_values,
 )
 from dlkf.frames.dataset import DRIVE, drive_folder, in_python
@@ -40,6 +41,7 @@ def navigate(
     model: str | Path = "plus",
     imu_type: str | Mapping[str, Any] = "automotive_mems",
     tuning: str | Mapping[str, Any] = "untuned",
+    prior: Mapping[str, Sequence[float]] | None = None,
     lever_arm: Sequence[float] = (0.0, 0.0, 0.0),
     smoothed: bool = False,
     rate_hz: float | None = None,
@@ -66,6 +68,9 @@ def navigate(
     tuning : str or mapping
         Factors on a Kalman filter's noise: a preset of ``conf/tuning`` (``any_car`` for a car of which nothing is
         known) or such factors by name, as ``dlkf tune`` finds them.
+    prior : mapping, optional
+        Of a filter with ``_prior``: ``mean`` and ``std`` of the IMU error before the drive, 3 biases of accelerometers
+        [m/s²] and 3 of gyroscopes [rad/s], of ``mbkf33`` then 18 elements of both sensor matrices.
     lever_arm : sequence of 3 floats
         IMU → antenna, Forward-Right-Down [m].
     smoothed : bool
@@ -111,7 +116,7 @@ def navigate(
     aids = {"speed": speed, "heading": heading, "baro": baro}
     with drive_folder(imu, gnss, None, lever_arm, aids) as folder:
         chosen = choose_aids(folder, None)
-        estimator = with_aids(load(model, imu_type=imu_type, tuning=tuning), chosen)
+        estimator = with_aids(load(model, imu_type=imu_type, tuning=tuning, prior=prior), chosen)
         named = {short_name(model): estimator}
         unused = describe_aids(named, [t for t in chosen if t not in find_tables(estimator)])
         slow = describe_slow_drives(named, drive_rates(folder).values(), "this drive has")
@@ -132,6 +137,7 @@ def load(
     *,
     imu_type: str | Mapping[str, Any] = "automotive_mems",
     tuning: str | Mapping[str, Any] = "untuned",
+    prior: Mapping[str, Sequence[float]] | None = None,
 ) -> Filter:
     """A filter by name, from a folder with ``weights.safetensors`` and ``config.yaml``, or from MLflow.
 
@@ -141,6 +147,8 @@ def load(
         As in :func:`navigate`.
     imu_type, tuning : str or mapping
         As in :func:`navigate`; where a trained filter does not take them they change nothing, with a warning.
+    prior : mapping, optional
+        As in :func:`navigate`; refused where the filter does not take it.
 
     Returns
     -------
@@ -153,6 +161,7 @@ def load(
         For anything else, listing what is known.
     """
     from dlkf.base.settings import settings_from
+    from dlkf.filters.build import check_prior_taken
     from dlkf.filters.tuning import Tuning
     from dlkf.navigation.imu_errors import imu_spec
     from dlkf.tracking.models import resolve_model, unused_settings
@@ -160,8 +169,11 @@ def load(
     factors = settings_from(Tuning, tuning_values(tuning), "tuning")
     model = check_model(model)
     noise = imu_values(imu_type)
+    known = prior_values(prior)
+    if known is not None:
+        check_prior_taken([model])
     with in_python():
-        resolved = resolve_model(model, imu_spec(noise), tuning=factors)
+        resolved = resolve_model(model, imu_spec(noise), tuning=factors, prior=known)
     given = {"imu_type": imu_type, "tuning": tuning}
     if line := unused_settings(model, [name for name, value in given.items() if value != DEFAULT_NOISE[name]]):
         warnings.warn(line, UserWarning, stacklevel=count_calls())
@@ -170,8 +182,8 @@ def load(
 
 def Stream(
     model: str | Path = "plus", *, rate_hz: float | None = None, imu_type: str | Mapping[str, Any] = "automotive_mems",
-    tuning: str | Mapping[str, Any] = "untuned", lever_arm: Sequence[float] = (0.0, 0.0, 0.0),
-    aids: str | Sequence[str] | None = None, **options: Any,
+    tuning: str | Mapping[str, Any] = "untuned", prior: Mapping[str, Sequence[float]] | None = None,
+    lever_arm: Sequence[float] = (0.0, 0.0, 0.0), aids: str | Sequence[str] | None = None, **options: Any,
 ) -> StreamingFilter:  # fmt: skip
     """A filter fed sample by sample and fix by fix, as in a vehicle.
 
@@ -181,7 +193,7 @@ def Stream(
         As in :func:`navigate`; a filter that is smoothed looks ahead and is refused.
     rate_hz : float, optional
         Rate the filter runs at [Hz], default its own; samples may come at any rate and jitter.
-    imu_type, tuning : str or mapping
+    imu_type, tuning, prior : str or mapping
         As in :func:`navigate`.
     lever_arm : sequence of 3 floats
         IMU → antenna, Forward-Right-Down [m].
@@ -214,7 +226,7 @@ def Stream(
     given = {"rate_hz": rate_hz, "epoch_s": epoch_s}
     check_above_zero(**{name: value for name, value in given.items() if value is not None})
     arm = check_lever_arm(options.pop("lever_arm_b", lever_arm))
-    estimator = load(model, imu_type=imu_type, tuning=tuning)
+    estimator = load(model, imu_type=imu_type, tuning=tuning, prior=prior)
     if aids is not None:
         estimator = add_chosen_aids(short_name(check_model(model)), estimator, check_aids(aids))
     grid = choose_grid([estimator], rate_hz, epoch_s, 1.0)
