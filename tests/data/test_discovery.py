@@ -20,7 +20,7 @@ from dlkf.data.discovery.motion import find_motion, integrate_level, position_de
 from dlkf.data.discovery.orientation import find_pose
 from dlkf.data.discovery.units import accel_units, nearest_unit, time_unit, unit_left
 from dlkf.data.intake import ingest_drives
-from dlkf.data.plausibility import check_clocks, describe_rotation
+from dlkf.data.plausibility import check_clocks, describe_delay, describe_rotation
 from dlkf.data.readers import units
 from dlkf.data.readers.auto import AutoReader
 from dlkf.data.readers.frames import DriveFrames
@@ -336,6 +336,13 @@ def test_units_by_size():
     assert "leap seconds" in describe_offset(18.1) and "3 GPS weeks" in describe_offset(3 * 604_800.0)
     assert "time zone of +2 h" in describe_offset(7200.0) and describe_offset(-63.0) == ""
     assert "has no date" in describe_offset(-1_421_625_596.8) and describe_offset(20 * 3600.0) == ""
+
+
+@pytest.mark.parametrize("late_s, said", [(0.0, ""), (0.15, ""), (0.5, "0.5 s later"), (-0.7, "0.7 s earlier")])
+def test_fixes_that_are_late_get_a_line(streets, late_s, said):
+    imu, gnss = ({k: v.to_numpy() for k, v in streets[kind].items()} for kind in ("imu", "gnss"))
+    line = describe_delay(imu, {**gnss, "t": gnss["t"] + late_s})
+    assert line is None if not said else said in line
 
 
 def test_a_sensor_that_seems_turned_gets_a_line(streets):

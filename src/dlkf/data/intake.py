@@ -15,7 +15,7 @@ import yaml
 from dlkf.base.errors import InputError
 from dlkf.base.files import absolute_place, is_url, replace_file
 from dlkf.base.parallel import check_engine, parallel_map
-from dlkf.data.plausibility import describe_drift, describe_rotation
+from dlkf.data.plausibility import describe_delay, describe_drift, describe_rotation
 from dlkf.data.readers.frames import DriveFrames, Place
 from dlkf.data.readers.settling import Unsure
 from dlkf.data.readers.sharing import agrees, layout, list_settings, pool_settings
@@ -52,7 +52,7 @@ class IngestOptions:
                 rows.append(write_drive(folder, part.meta, part.imu, part.gnss, part.reference, part.aids))
                 if part.gnss is not None:
                     tables = read_drive(folder, DriveRow(part.name, part.name, (0.0, 0.0, 0.0)), limits=self.limits)
-                    for check in (describe_cover, describe_drift, describe_rotation):
+                    for check in (describe_cover, describe_drift, describe_delay, describe_rotation):
                         if line := check(tables.imu, read_fixes(tables.gnss)):
                             detail.append(f"{part.name}: {line}")
                 else:

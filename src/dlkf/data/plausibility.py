@@ -38,6 +38,7 @@ FARTHEST_KM = 2000.0
 SEARCH_S = 600.0  # clocks of logs that have time in common are hardly further apart
 APART_S = 1.0  # less is a delay, which the filters bear; dlkf.ingest measures it on request
 WORST_PPM = 1e5  # of clocks that both count seconds
+LATE_S = 0.3  # more than the search is ever off (0.2 s on 50 real drives)
 DRIFTED_S = 0.1  # from a drive's first to its last second: worth a line
 SHORTEST_S = 60.0  # of a drive whose drift is observable
 TURNED_DEG = (30.0, 150.0)  # backwards is found by the filters' own search
@@ -320,6 +321,19 @@ def describe_drift(imu: Columns, gnss: Columns) -> str | None:
         f"the clock of the IMU runs {'faster' if pose.drift > 0 else 'slower'} than that of GNSS by "
         f"{1e6 * abs(pose.drift):.0f} ± {1e6 * pose.drift_std:.0f} ppm, {abs(pose.drift) * span:.2f} s over the drive; "
         "reader.gnss.time.drift_ppm=auto and offset_s=auto take it out"
+    )
+
+
+def describe_delay(imu: Columns, gnss: Columns) -> str | None:
+    """A line about fixes that are late or early by less than :func:`check_clocks` refuses; None where none is found."""
+    best = find_lag(ImuSums.of_table(imu), find_motion(gnss), APART_S)
+    if best is None or not best.certain or abs(best.peak_s) < LATE_S:
+        return None
+    side = "later" if best.peak_s < 0 else "earlier"
+    return (
+        f"fixes are stamped about {abs(best.peak_s):.1f} s {side} than the motion that the IMU feels: plus and filters "
+        "with +receiver estimate it, others follow it; dlkf doctor measures it, reader.gnss.time.offset_s=auto takes "
+        "it out"
     )
 
 
