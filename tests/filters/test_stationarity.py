@@ -13,7 +13,16 @@ from dlkf.data.drive import EPOCHWISE, Batch
 from dlkf.filters.build import build_filter
 from dlkf.filters.constraints import CarConstraints
 from dlkf.filters.integration import integrate
-from dlkf.filters.stationarity import APART, MEMORY_S, LastSecond, VibrationLevel, _acceleration_std
+from dlkf.filters.stationarity import (
+    APART,
+    CHANGED_ACCEL,
+    MEMORY_S,
+    REST_S,
+    LastSecond,
+    Rest,
+    VibrationLevel,
+    _acceleration_std,
+)
 from dlkf.filters.tuning import Tuning
 from dlkf.navigation.attitude import rotation_from_rpy, rotation_from_vector
 from dlkf.navigation.state import ACCEL, ATTITUDE, NavState
@@ -77,6 +86,41 @@ def test_constant_speed_without_vibration_is_no_standstill(name):
     taken = found(batch, name, accel_noise=30.0, accel_walk=100.0)
     assert taken[:, 2:9].any()  # under GNSS it is found
     assert not taken[:, 31:].any()
+
+
+@pytest.mark.parametrize("name", ["mbkf15_nhc", "mbkf21_car", "mbkf33_car"])
+def test_a_car_that_creeps_under_gnss_is_not_stopped(name):
+    """At 0.4 to 0.8 m/s, as calm as at rest, with velocities of 5 cm/s: below the speed at which a filter alone may
+    take it for a standstill."""
+    batch = steady((0.4, 0.6, 0.8), 120)
+    batch = replace(batch, gnss_std=torch.cat((batch.gnss_std[..., :3], 0 * batch.gnss_std[..., 3:] + 0.05), -1))
+    taken, solution = watched(batch, name, accel_noise=30.0, accel_walk=100.0)
+    assert taken[:, 2:9].all() and not taken[:, 40:].any()
+    assert (solution.posterior.v_n - batch.truth.v_n)[:, 40:].norm(dim=-1).max() < 0.15
+
+
+@pytest.mark.parametrize("name", ["mbkf21_car", "mbkf33_car"])
+def test_a_car_that_pulls_away_in_an_outage_is_not_held_by_its_standstill(name):
+    """Gently, while the filter's tilt may explain the acceleration: its force differs from that of the standstill. For
+    three seconds; later its speed has to tell."""
+    batch = outage(steady((2.0, 3.0, 4.0), 60, stand_s=30), 20, 60)  # 0.1 to 0.2 m/s²
+    batch = replace(batch, start_std=torch.full_like(batch.start_std, 0.03))
+    taken = found(batch, name, accel_noise=30.0, accel_walk=100.0)
+    assert taken[:, 25:29].all() and not taken[:, 30:33].any()
+
+
+def test_the_force_of_a_standstill_is_known_during_it_and_for_seconds_after():
+    rest = Rest.begin(torch.zeros(1, dtype=D), 2)
+    at_rest, off = torch.tensor([[0.1, 0.0], [0.0, -0.1]], dtype=D), torch.tensor([1.2 * CHANGED_ACCEL, 0.0], dtype=D)
+    assert not rest.has_changed(at_rest).any()  # nothing known
+    for _ in range(3):
+        rest = rest.update(at_rest, torch.tensor([True, True]), 1.0)
+    assert rest.has_changed(at_rest + off).all() and not rest.has_changed(at_rest + 0.5 * off).any()
+    for _ in range(int(REST_S)):
+        rest = rest.update(at_rest + off, torch.tensor([False, True]), 1.0)
+    assert rest.has_changed(at_rest + off).tolist() == [True, False]  # the second one stands on another slope
+    rest = rest.update(at_rest + off, torch.tensor([False, False]), 1.0)
+    assert not rest.has_changed(at_rest + 10 * off)[0]
 
 
 def test_a_smoother_road_than_any_before_is_no_standstill():
@@ -176,7 +220,7 @@ def test_the_level_is_that_of_a_second_whatever_the_update_interval():
         cut = in_parts(batch, per_second) if per_second > 1 else batch
         second, levels = LastSecond.begin(cut), []
         for k in range(cut.size[1]):
-            second, level, mean = second.update(cut.imu[:, k], cut.dt)
+            second, level, mean, whole = second.update(cut.imu[:, k], cut.dt)
             assert level is not None
             levels.append(level)
         torch.testing.assert_close(torch.stack(levels, 1)[:, per_second - 1 :: per_second], torch.from_numpy(expected))

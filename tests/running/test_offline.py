@@ -88,6 +88,13 @@ def test_the_summary_counts_the_fixes_of_the_file():
     assert "solution from t = 10.0 s, none for the 10 fixes before, 1190 epochs, 1149 of 1200 fixes used" in said
 
 
+def test_the_summary_says_how_long_a_restart_took():
+    result = driven(0).result
+    t = result.table.t
+    gone = replace(result, table=result.table[(t < 300) | (t > 400)], restarts=(100.0, 300.0, float(t.iloc[-1])))
+    assert "started over at t = 100, 300 (no solution until 401), 1199 (no solution after it) s" in gone.summary()
+
+
 def test_the_summary_says_where_the_car_goes_in_the_axes_of_its_imu():
     """Of an IMU that is turned about the vertical; not of a course that only scatters, nor of slow rows."""
     result = driven(0).result

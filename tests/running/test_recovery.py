@@ -154,15 +154,31 @@ def test_a_filter_is_lost_after_fixes_in_a_row_far_off():
     watch = LossWatch()
     for k in range(LOST_FIXES):
         assert not watch.is_lost(k)
-        watch = watch.update(float(k), 1.0, [k])
-        assert watch.update(k + 0.5, 1.0, [k]) == watch  # the same place again
+        watch = watch.update(float(k), 1.0, [k], [30.0, 0.0, 0.0])
+        assert watch.update(k + 0.5, 1.0, [k], [30.0, 0.0, 0.0]) == watch  # the same place again
     assert watch.count == LOST_FIXES and not watch.is_lost(LOST_S - 1) and watch.is_lost(LOST_S)
-    assert watch.update(20.0, 0.0, [0]).count == 0
+    assert watch.update(20.0, 0.0, [0], [1.0, 0.0, 0.0]).count == 0
     watch = LossWatch()
     for k in range(2 * LOST_FIXES):
         assert not watch.is_lost(k)
-        watch = watch.update(float(k), 0.5, [k])
+        watch = watch.update(float(k), 0.5, [k], [0.0, 12.0, 0.0])
     assert not watch.is_lost(2 * LOST_S - 1) and watch.is_lost(2 * LOST_S)
+
+
+def test_fixes_that_scatter_about_a_filter_do_not_make_it_lost():
+    """Between houses, 15 m each way and stated to be good; 20 m to one side, they do."""
+    rng, lost = np.random.default_rng(0), []
+    for mean in (0.0, 20.0):
+        ends = []
+        for _ in range(100):
+            watch = LossWatch()
+            for k in range(20):
+                off = mean * np.array([1.0, 0, 0]) + rng.normal(0, 15.0 if mean == 0 else 3.0, 3) * [1, 1, 0]
+                share = float(far_off(torch.tensor([*off, 0, 0, 0]), torch.full((6,), 0.5)))
+                watch = watch.update(float(k), share, [k], off)
+            ends.append(watch.is_lost(20.0))
+        lost.append(np.mean(ends))
+    assert lost[0] == 0.0 and lost[1] > 0.9
 
 
 def test_the_batch_run_starts_over_as_the_stream_does(drive):

@@ -16,7 +16,9 @@ that its noise does not know spoils it so much.
 
 Carrier-phase positions show motion as velocities do. Of positions that are off by metres, two that lie ``SPAN_S`` apart
 do: the filter's own 1σ shows nothing, for a wrong standstill would confirm itself. Where fixes show a standstill for
-some seconds, its vibration does not matter.
+some seconds, its vibration does not matter. Where the mean of their velocities, since the last acceleration or turn, is
+none of a standstill, there is none, whatever the filter takes its speed for. In a standstill the measured force stays as
+it is: a change shows a car that pulls away, though errors of tilt might explain the acceleration.
 """
 
 from __future__ import annotations
@@ -54,6 +56,9 @@ SPAN_S, SPAN_LEFT_S = 5.0, 10.0  # s between two positions that show a mean spee
 SPAN_SIGMAS, SPAN_STANDING = 3.0, 0.3  # 1σ that a mean speed is beyond MOVING_SPEED; m/s, that of a standstill
 LONG_ACCEL = 0.2  # m/s², instead of STILL_ACCEL, of a long rest: a filter with a wrong speed has a wrong tilt
 LONG_S, LONG_SIGMAS, ALIKE = 10.0, 20.0, 2.0  # s, 1σ of the speed: of a standstill at most so many times its level
+CHANGED_ACCEL, REST_S = 0.08, 3.0  # m/s² from the force of a standstill; s over which it is known, and kept after it
+CREEPING_SPEED, CREEPING_SIGMAS = 0.05, 3.5  # of the mean velocity of fixes at a standstill: at most, m/s and 1σ
+MOST_FIXES, FIX_S = 10.0, 3.0  # in that mean; s after the last of them that it counts
 LONG_SPEED, FAR_APART = 10.0, 30.0  # m/s, at most; a level of rest is taken for so many times below that of motion
 
 
@@ -73,9 +78,9 @@ class LastSecond(NamedTuple):
 
     def update(
         self, imu: Float[Tensor, "B M 6"], dt: float
-    ) -> tuple[LastSecond, Float[Tensor, " B"] | None, Float[Tensor, "B 6"]]:
-        """After the samples of an update interval, the vibration level (None: too few samples for one), and the mean
-        over the interval, or the last 0.2 s if it is shorter."""
+    ) -> tuple[LastSecond, Float[Tensor, " B"] | None, Float[Tensor, "B 6"], Float[Tensor, "B 6"]]:
+        """After the samples of an update interval, the vibration level (None: too few samples for one), the mean
+        over the interval, or the last 0.2 s if it is shorter, and that over the interval, or a second if shorter."""
         parts = _Parts.of(imu.shape[1], dt)
         means = imu[:, imu.shape[1] - parts.each * parts.samples :]
         if parts.samples > 1:
@@ -88,6 +93,7 @@ class LastSecond(NamedTuple):
             LastSecond(None if self.means is None else means),
             level,
             means[:, -max(parts.each, 2 * parts.together) :].mean(1),
+            means.mean(1),
         )
 
 
@@ -149,6 +155,52 @@ class PositionSpan(NamedTuple):
         return span, standing, moving
 
 
+class Rest(NamedTuple):
+    """What a standstill has to agree with: its own specific force so far, and the fixes' velocities."""
+
+    force: Tensor  # (B, 2) m/s² forward and right as measured, mean over the last standstill; NaN: none
+    left_s: Tensor  # (B,) s since it
+    velocity: Tensor  # (B, 2) m/s, mean of fixes since the car shows no acceleration and no turn
+    std: Tensor  # (B,) m/s, 1σ of the last of them
+    fixes: Tensor  # (B,) how many
+    fix_age_s: Tensor  # (B,) s since the last of them
+
+    @classmethod
+    def begin(cls, like: Tensor, batch_size: int) -> Rest:
+        """Nothing known."""
+        zero = like.new_zeros(batch_size)
+        none = like.new_full((batch_size, 2), math.nan)
+        return cls(none, zero, torch.zeros_like(none), zero, zero, zero)
+
+    def has_changed(self, force: Float[Tensor, "B 2"]) -> Bool[Tensor, " B"]:
+        """Whether the force differs from that of the standstill that has just been: the car pulls away. Errors of tilt
+        and accelerometers, which may look like any acceleration, do not change within seconds."""
+        return (force - self.force).norm(dim=-1) > CHANGED_ACCEL
+
+    def meet_fix(self, epoch: Epoch, with_velocity: Bool[Tensor, " B"], still: Bool[Tensor, " B"]) -> Rest:
+        """With the velocity of the window's fix; those before an acceleration or a turn do not count."""
+        old = ~still | (self.fix_age_s > FIX_S)
+        n = torch.where(old, 0.0, self.fixes) + with_velocity.to(self.fixes.dtype)
+        fix = epoch.at_fix.v_n[:, :2] + epoch.z[:, 3:5]
+        mean = torch.where(old.unsqueeze(-1), 0.0, self.velocity)
+        gained = torch.where(with_velocity.unsqueeze(-1), (fix - mean) / n.clamp_min(1.0).unsqueeze(-1), 0.0)
+        age = torch.where(with_velocity, 0.0, self.fix_age_s + epoch.span_s)
+        std = torch.where(with_velocity, epoch.fix.std[:, 3:5].amax(-1), self.std)
+        return self._replace(velocity=mean + gained, std=std, fixes=n.clamp_max(MOST_FIXES), fix_age_s=age)
+
+    def creeps(self) -> Bool[Tensor, " B"]:
+        """Whether the mean velocity of the fixes is none of a standstill."""
+        std = self.std / self.fixes.clamp_min(1.0).sqrt()
+        return (self.fixes > 0) & (self.velocity.norm(dim=-1) > CREEPING_SPEED + CREEPING_SIGMAS * std)
+
+    def update(self, force: Float[Tensor, "B 2"], stationary: Bool[Tensor, " B"], span: float) -> Rest:
+        """After a window."""
+        left = torch.where(stationary, 0.0, self.left_s + span)
+        known = torch.where(self.force.isnan(), force, torch.lerp(self.force, force, -math.expm1(-span / REST_S)))
+        kept = torch.where((left > REST_S).unsqueeze(-1), math.nan, self.force)
+        return self._replace(force=torch.where(stationary.unsqueeze(-1), known, kept), left_s=left)
+
+
 class VibrationLevel(NamedTuple):
     """Vibration levels of a car: spread of specific force times spread of rate [m/s² rad/s], of means over
     ``AVERAGE_S``; inf: nothing yet."""
@@ -160,13 +212,17 @@ class VibrationLevel(NamedTuple):
     rest_s: Tensor  # (B,) s of these at the level of one
     span: PositionSpan
     second: LastSecond
+    rest: Rest
 
     @classmethod
     def begin(cls, batch: Batch) -> VibrationLevel:
         """Before the first sample."""
         like, B = batch.imu, batch.size[0]
         nothing, zero = like.new_full((B,), math.inf), like.new_zeros(B)
-        return cls(nothing, nothing, zero, zero, zero, PositionSpan.begin(like, B), LastSecond.begin(batch))
+        return cls(
+            nothing, nothing, zero, zero, zero, PositionSpan.begin(like, B), LastSecond.begin(batch),
+            Rest.begin(like, B),
+        )  # fmt: skip
 
     def thresholds(
         self, prior: Float[Tensor, " 1"]
@@ -224,7 +280,7 @@ def detect_stationary(
     forbids a standstill, one that is stopped makes it where the samples show neither acceleration nor turn, at any
     vibration; and both give levels of this car where GNSS gives no velocity.
     """
-    second, level, mean = before.second.update(epoch.corrected, epoch.dt)
+    second, level, mean, whole = before.second.update(epoch.corrected, epoch.dt)
     if level is None:
         return torch.zeros_like(before.standing) > 0, before
     span = epoch.span_s
@@ -238,11 +294,15 @@ def detect_stationary(
     unlearned = before.standing.isinf() & before.moving.isinf()
     doubt = torch.where(unlearned, doubt.clamp_max(UNLEARNED_ACCEL), doubt)
     straight = turn < STILL_RATE + 2 * diagonal[:, GYRO].sum(-1).sqrt()
+    force = whole[:, :2] + epoch.imu_error[:, :2]
+    straight = straight & ~before.rest.has_changed(force)
     still, still_long = (straight & (gained < limit + doubt) for limit in (STILL_ACCEL, LONG_ACCEL))
     fixed, with_velocity = epoch.used[:, :2].all(-1), epoch.used[:, 3:5].all(-1)
     exact = fixed & (epoch.fix.std[:, :2].amax(-1) < CARRIER_STD)
     sure = (with_velocity | exact) & (std < SURE_STD)
-    standing, moving = sure & (speed + std < STANDING_SPEED), sure & (speed - std > MOVING_SPEED)
+    rest = before.rest.meet_fix(epoch, with_velocity, still)
+    creeps = rest.creeps()
+    standing, moving = sure & (speed + std < STANDING_SPEED) & ~creeps, sure & (speed - std > MOVING_SPEED)
     if wheel is not None:
         stopped = wheel.stopped & still
         standing, moving = standing & ~wheel.rolling | stopped, (moving | wheel.rolling) & ~stopped
@@ -266,10 +326,10 @@ def detect_stationary(
     long = (speed < (LONG_SIGMAS * std).clamp_max(LONG_SPEED)) & (rest_s > LONG_S - 0.5 * span)
     stationary = calm & still & (slow | plausible) | long
     proven = sure & still & (still_s > PROVEN_S - 0.5 * span) & (speed + 2 * std < PROVEN_SPEED)
-    stationary = stationary | proven
+    stationary = (stationary | proven) & ~creeps
     if wheel is not None:
         stationary = stationary & ~wheel.rolling | stopped
-    return stationary, after
+    return stationary, after._replace(rest=rest.update(force, stationary, span))
 
 
 def _speed_doubt(

@@ -27,7 +27,7 @@ from dlkf.filters.learned import LearnedMemory
 from dlkf.filters.learned_kalman import LearnedKalmanMemory
 from dlkf.filters.model_based import KalmanMemory
 from dlkf.filters.plus import PlusMemory
-from dlkf.filters.stationarity import LastSecond, PositionSpan
+from dlkf.filters.stationarity import LastSecond, PositionSpan, Rest
 from dlkf.filters.vibration_speed import VibrationMemory
 from dlkf.filters.virtual_outages import VirtualOutage
 from dlkf.navigation.attitude import skew
@@ -130,6 +130,7 @@ RULES: Rules = {
     KalmanMemory: {"P": Stretch.covariance},
     PositionSpan: begin_anew,
     LastSecond: begin_anew,
+    Rest: begin_anew,
     VibrationMemory: {"block": ANEW, "last_sample": ANEW, "age": Stretch.time},
     LearnedMemory: {"posterior": Stretch.state, "elapsed": Stretch.time, "since_fix": Stretch.time},
     LearnedKalmanMemory: {},

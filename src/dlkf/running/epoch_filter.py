@@ -178,7 +178,8 @@ class EpochFilter:
         watch = running.watch
         if bool(fix.used[:, :3].any()):
             share = float(far_off(step.innovation, fix.std))
-            watch = watch.update(epoch.number * self._epoch_s, share, held.r_e[0].tolist())
+            off = step.innovation[0, :3].tolist()
+            watch = watch.update(epoch.number * self._epoch_s, share, held.r_e[0].tolist(), off)
         nowhere = is_impossible(step.posterior.v_n, step.posterior.p_n, running.frame.height.to(step.posterior.p_n))
         if watch.is_lost(epoch.number * self._epoch_s) or bool(nowhere):
             self.counts["lost"] += 1

@@ -2,13 +2,17 @@
 
 Gates inside filters judge one fix by the filter. Here fixes that passed the physical limits (:mod:`dlkf.data.limits`)
 judge the filter: if its position is far off in ``LOST_FIXES`` of them in a row, over ``LOST_S`` seconds, or less far in
-more of them, it must start over with an alignment. A receiver that repeats its last position, as many do in a tunnel,
-says nothing by it: such a fix does not count. So a filter whose attitude was ruined by damaged samples comes back,
+more of them, it must start over with an alignment. So a filter whose attitude was ruined by damaged samples comes back,
 a gated one too, which would refuse good fixes for ever.
+
+Two fixes do not count. One that is farther from the last fix, as seen from the filter, than from the filter itself
+agrees with neither: errors of a receiver between houses. One of a receiver that repeats its last position, as many do
+in a tunnel, says nothing.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -21,21 +25,25 @@ from dlkf.filters.integration import BatchSolution
 
 
 class LossWatch(NamedTuple):
-    """Fixes in a row that lie far off, the sum of their shares (:func:`far_off`), the time [s] of the first of them,
-    and the place of the last fix."""
+    """Fixes in a row that lie far off and agree with each other, the sum of their shares (:func:`far_off`), the time
+    [s] of the first of them, the place of the last fix, and what the last one of the row is off by [m]."""
 
     count: int = 0
     total: float = 0.0
     since: float = 0.0
     place: tuple[float, ...] = ()
+    off: tuple[float, ...] = ()
 
-    def update(self, t: float, share: float, place: Sequence[float]) -> LossWatch:
-        """After a fix at ``t`` [s]; ``place`` is its position, in any axes."""
+    def update(self, t: float, share: float, place: Sequence[float], off: Sequence[float]) -> LossWatch:
+        """After a fix at ``t`` [s]; ``place`` is its position, in any axes, ``off`` its innovation."""
         if (place := tuple(place)) == self.place:
             return self
         if share == 0:
             return LossWatch(place=place)
-        return LossWatch(self.count + 1, self.total + share, self.since if self.count else t, place)
+        off = tuple(off)
+        if self.off and math.dist(off, self.off) > math.hypot(*off):
+            return self._replace(place=place, off=off)
+        return LossWatch(self.count + 1, self.total + share, self.since if self.count else t, place, off)
 
     def is_lost(self, t: float) -> bool:
         """Whether that is enough at ``t`` [s]."""
@@ -72,7 +80,8 @@ def find_first_loss(batch: Batch, row: int, solution: BatchSolution) -> int | No
     watch = LossWatch()
     for k in torch.nonzero(offered).flatten().tolist():
         t = k * batch.epoch_s
-        watch = watch.update(t, float(far[k]), batch.gnss[row, k, :3].tolist())
+        off = solution.innovation[row, k, :3].tolist()
+        watch = watch.update(t, float(far[k]), batch.gnss[row, k, :3].tolist(), off)
         if watch.is_lost(t):
             return k if at is None else min(at, k)
     return at

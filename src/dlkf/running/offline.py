@@ -42,6 +42,7 @@ WORTH_SAYING = 0.01  # probability of another heading
 SIGMAS = 3.0  # what differs from what a log says by so many 1σ is worth saying
 OF_RECEIVER = {DELAY: 0.01, **dict.fromkeys(ARM, 0.1), DRIFT: 30.0}  # s, m, ppm: 1σ of what no model of a car contains
 SAMPLES_AT_ONCE = CHUNK_SAMPLES  # IMU samples of drives in memory, 8 h at 50 Hz
+LONG_RESTART_S = 10.0  # without rows, before the next is named
 FASTER_THAN_REVERSE = 8.0  # m/s
 ASKEW = math.radians(10.0)  # between course and heading; the constraints' mounting angles are expected to be smaller
 VIBRATION = "vibration_speed"
@@ -158,8 +159,16 @@ class Navigated:
         if any(self.refused):
             text += f", left out as impossible: {self.refused}"
         if self.restarts:
-            text += ", lost and started over at t = " + ", ".join(f"{t:.0f}" for t in self.restarts[:5]) + " s"
+            text += ", lost and started over at t = " + ", ".join(self._describe_restart(t) for t in self.restarts[:5])
+            text += " s"
         return text
+
+    def _describe_restart(self, t: float) -> str:
+        """Its time [s], with that of the next row where it took long."""
+        rows = self.table.t.to_numpy()
+        after = rows[rows > t + 1e-6]
+        missing = f"no solution until {after[0]:.0f}" if len(after) else "no solution after it"
+        return f"{t:.0f}" if len(after) and after[0] - t < LONG_RESTART_S else f"{t:.0f} ({missing})"
 
     @property
     def sensor_columns(self) -> list[str]:

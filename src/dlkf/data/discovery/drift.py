@@ -13,7 +13,8 @@ from dlkf.data.discovery.orientation import Pose, find_pose
 
 WORTH_A_LOOK, DOUBTFUL, CERTAIN = 1.5, 2.0, 4.5  # σ; a drift blurs the fit, so the first look's σ is too large
 LEAST_S = 0.008  # from the middle of the drive to its ends: less does not matter
-LEAST_STEP_S, STEPS = 0.25, 0.9  # of a clock; of the misfit with a drift, that of a step is less
+LEAST_STEP_S, STEPS = 0.25, 0.9  # of a clock; of the misfit with a drift or one lag, that of a step is less
+LAGS = 7  # from that of the one end to that of the other
 WORSE = 1.0  # misfit of a turn, or of an acceleration, at a wrong lag; straight roads have none
 ROUNDS = 6
 FEWEST = 60  # fixes of a drive whose ends are compared
@@ -48,15 +49,18 @@ def compare_ends(imu: ImuSums, gnss: Motion) -> Ends | None:
 
 def find_step(imu: ImuSums, gnss: Motion, ends: Ends) -> tuple[float, float] | None:
     """Between which times a clock steps from the lag of one end to that of the other: where the car turns, brakes and
-    accelerates before and after it. None where a drift explains the motion as well, or the step is small."""
+    accelerates before and after it. None where a drift or one lag explains the motion as well, or the step is small."""
     if abs(ends.last_s - ends.first_s) < LEAST_STEP_S:
         return None
     begin = float(gnss.t[gnss.t <= gnss.t[0] + (gnss.t[-1] - gnss.t[0]) / 3].mean())
     at, drifting = compute_misfits(imu, gnss, lambda t: ends.first_s + ends.drift * (t - begin))
+    rivals = [drifting.sum()]
+    for lag in np.linspace(ends.first_s, ends.last_s, LAGS):
+        rivals.append(compute_misfits(imu, gnss, lambda t, lag=lag: 0 * t + lag)[1].sum())
     before = compute_misfits(imu, gnss, lambda t: 0 * t + ends.first_s)[1]
     after = compute_misfits(imu, gnss, lambda t: 0 * t + ends.last_s)[1]
     until = np.concatenate(([0.0], np.cumsum(before))) + np.concatenate((np.cumsum(after[::-1])[::-1], [0.0]))
-    if until.min() > STEPS * drifting.sum():
+    if until.min() > STEPS * min(rivals):
         return None
     near = np.flatnonzero(until < until.min() + WORSE)
     return float(at[max(near[0] - 1, 0)]), float(at[min(near[-1], len(at) - 1)])

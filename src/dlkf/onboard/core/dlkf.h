@@ -115,6 +115,7 @@ typedef struct {
 typedef struct {
   double since, total; /* of fixes in a row far off the filter: time of the first, sum of how far */
   double place[3];     /* of the last fix, r_e */
+  double off[3];       /* innovation of the last one of the row */
   int32_t count;
 } dlkf_watch;
 

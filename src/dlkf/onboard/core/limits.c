@@ -74,10 +74,21 @@ int dlkf_lost(dlkf *d, int64_t number, const double *fix) {
   if (!repeated && (fix[12] > 0 || fix[13] > 0 || fix[14] > 0)) {
     const double std = sqrt(fix[6] * fix[6] + fix[7] * fix[7] + fix[8] * fix[8]) * LOST_SIGMAS;
     const double share = sqrt(z[0] * z[0] + z[1] * z[1] + z[2] * z[2]) / (std > LOST_M ? std : LOST_M);
-    const int far = share > LOST_SHARE;
-    if (far && !d->watch.count) d->watch.since = t;
-    d->watch.total = far ? d->watch.total + (share < 1 ? share : 1) : 0;
-    d->watch.count = far ? d->watch.count + 1 : 0;
+    const int far = share > LOST_SHARE, first = far && !d->watch.count;
+    double apart = 0, size = 0; /* from the last one of the row, which it has to agree with */
+    for (int k = 0; k < 3; k++) {
+      apart += (z[k] - d->watch.off[k]) * (z[k] - d->watch.off[k]);
+      size += z[k] * z[k];
+    }
+    if (first) d->watch.since = t;
+    if (!far) {
+      d->watch.total = 0;
+      d->watch.count = 0;
+    } else if (first || !(sqrt(apart) > sqrt(size))) {
+      d->watch.total += share < 1 ? share : 1;
+      d->watch.count++;
+    }
+    for (int k = 0; k < 3; k++) d->watch.off[k] = z[k];
     if (held) memcpy(d->watch.place, held->r_e, sizeof d->watch.place);
   }
   const double *p = d->outputs + DLKF_OUTPUTS_POSTERIOR, *v = p + 3;
