@@ -17,8 +17,8 @@ that its noise does not know spoils it so much.
 Carrier-phase positions show motion as velocities do. Of positions that are off by metres, two that lie ``SPAN_S`` apart
 do: the filter's own 1σ shows nothing, for a wrong standstill would confirm itself. Where fixes show a standstill for
 some seconds, its vibration does not matter. Where the mean of their velocities, since the last acceleration or turn, is
-none of a standstill, there is none, whatever the filter takes its speed for. In a standstill the measured force stays as
-it is: a change shows a car that pulls away, though errors of tilt might explain the acceleration.
+none of a standstill, there is none, whatever the filter takes its speed for. In a standstill the measured force is
+constant: a change shows a car that pulls away, though errors of tilt might explain the acceleration.
 """
 
 from __future__ import annotations

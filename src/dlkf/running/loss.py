@@ -5,7 +5,7 @@ judge the filter: if its position is far off in ``LOST_FIXES`` of them in a row,
 more of them, it must start over with an alignment. So a filter whose attitude was ruined by damaged samples comes back,
 a gated one too, which would refuse good fixes for ever.
 
-Two fixes do not count. One that is farther from the last fix, as seen from the filter, than from the filter itself
+Two kinds of fixes do not count. One that is further from the last one, as seen from the filter, than from the filter
 agrees with neither: errors of a receiver between houses. One of a receiver that repeats its last position, as many do
 in a tunnel, says nothing.
 """
