@@ -13,7 +13,6 @@ import numpy as np
 import pandas as pd
 import torch
 
-from dlkf.base.angles import circular_median, wrap_angle
 from dlkf.base.console import ProgressCallback
 from dlkf.base.errors import InputError, no_drives
 from dlkf.data.alignment import SEARCH, AlignConfig, Start
@@ -33,6 +32,7 @@ from dlkf.navigation.compiled import without_loops
 from dlkf.running.batched import CHUNK_SAMPLES, pack, run_filter
 from dlkf.running.innovations import FAR, Innovation, fit_sigma, rms, worst_stretch
 from dlkf.running.loss import find_first_loss
+from dlkf.running.mounting import describe_mounting
 from dlkf.running.solution import SCHEMA, solution_table
 from dlkf.running.start import align_each
 from dlkf.running.start.entry import SLACK_S, SLOWEST_FIXES_S, SLOWEST_START_S
@@ -43,8 +43,6 @@ SIGMAS = 3.0  # what differs from what a log says by so many 1σ is worth saying
 OF_RECEIVER = {DELAY: 0.01, **dict.fromkeys(ARM, 0.1), DRIFT: 30.0}  # s, m, ppm: 1σ of what no model of a car contains
 SAMPLES_AT_ONCE = CHUNK_SAMPLES  # IMU samples of drives in memory, 8 h at 50 Hz
 LONG_RESTART_S = 10.0  # without rows, before the next is named
-FASTER_THAN_REVERSE = 8.0  # m/s
-ASKEW = math.radians(10.0)  # between course and heading; the constraints' mounting angles are expected to be smaller
 VIBRATION = "vibration_speed"
 MOSTLY = 0.5  # of the updates of a further sensor; where fewer are used, its numbers are likely wrong
 
@@ -105,22 +103,6 @@ def choose_epoch(spacings: Iterable[UsableFixes], rate_hz: float, estimator: Fil
     return closest if closest < 1.0 and whole and not constrained else 1.0
 
 
-def _describe_mounting(table: pd.DataFrame) -> str:
-    """Where a car that moves faster than a reversing one goes in the axes of its IMU, unless that is forward."""
-    north, east, yaw = (table[column].to_numpy(float) for column in ("vel_n", "vel_e", "yaw"))
-    fast = np.hypot(north, east) > FASTER_THAN_REVERSE
-    if not fast.any():
-        return ""
-    course = wrap_angle(np.arctan2(east, north) - yaw)[fast]
-    if np.mean(np.abs(course) > np.pi / 2) > 0.9:
-        return "backwards all the way (an IMU mounted the other way round?), "
-    turned, off = circular_median(course)
-    if abs(turned) < ASKEW or np.mean(np.abs(off) < ASKEW) < 0.9:
-        return ""
-    side = "right" if turned > 0 else "left"
-    return f"{np.degrees(abs(turned)):.0f}° to the {side} of the IMU's x axis (dlkf doctor measures its mounting), "
-
-
 @dataclass(frozen=True)
 class Navigated:
     """A drive's solution: its table, the time [s, file clock] at which the filter could start, and the probability
@@ -143,7 +125,7 @@ class Navigated:
         if self.doubt > WORTH_SAYING:
             text += f"heading ambiguous (the alternatives have probability {self.doubt:.2g}), "
         text += f"{len(self.table)} epochs, "
-        text += _describe_mounting(self.table)
+        text += describe_mounting(self.table)
         if spacing is None:
             text += f"{used} fixes used"
         else:
