@@ -5,9 +5,9 @@
 From the first on, fixes get errors that the reported 1σ does not know: positions off by 3, 1 or 30 m (1σ per axis) in
 some seconds, by one error of 3 m for ten seconds about every 50 s, by 0.3, 1 or 3 m in all, or by 1 m that wanders over
 30 s; velocities off by 5 m/s in some, by 0.5 m/s in all, or those of a second before. Or the IMU has a turn-on bias, of
-random direction, beside its own, or gyroscopes whose scale factors are 1 or 3 % off. Or the files are wrong: stamps of
-fixes 0.1 or 0.3 s late, clocks 100 or 300 ppm apart, an antenna 1.4 m from where the lever arm says, one of 500 samples
-of a sensor spoiled.
+random direction, beside its own, gyroscopes whose scale factors are 1 or 3 % off, or biases that step. Or the files are
+wrong: stamps of fixes 0.1 or 0.3 s late, clocks 100 or 300 ppm apart, an antenna 1.4 m from where the lever arm says,
+one of 500 samples of a sensor spoiled.
 
 ``outages.md``: the outages of :mod:`pipelines.studies.plus` on real motion and on ``fleet``; the entirely real drives
 start on the wrong data, alone with biases (elsewhere the start is the truth with an error, which shows no bias). RMS /
@@ -55,7 +55,8 @@ from dlkf.navigation.earth import ned_axes
 from dlkf.onboard.compiled_filter import compile_filter
 from dlkf.running.start import align_each
 
-LASTS_S, EVERY_S = 10, (20, 60)  # of a step, and the time between two
+LASTS_S, EVERY_S = 10, (20, 60)  # of a step in positions, and the time between two
+BIASES_LAST_S = (60, 180)  # between two steps of biases
 LONGEST_S = 3600
 FLEET, BASE, STATISTICS = "fleet", "mbkf33_car", ("rms", "log")
 POSITIONS_ALONE, WITH_VELOCITIES = ("wid", "wid_mru", "puck"), ("fleet", "phone")  # datasets of starts
@@ -130,6 +131,19 @@ def gyro_scale(off: float) -> Change:
     return lambda drive, g: replace(drive, imu=drive.imu * factor)
 
 
+def bias_steps(accel: float, gyro_dps: float) -> Change:
+    """Biases that change by 1σ of so much per axis [m/s², °/s], again and again."""
+    size = torch.tensor([accel] * 3 + [math.radians(gyro_dps)] * 3, dtype=torch.float64)
+
+    def change(drive: Drive, g: torch.Generator) -> Drive:
+        imu, k = drive.imu.clone(), 0
+        while (k := k + int(torch.randint(*BIASES_LAST_S, (1,), generator=g) / drive.epoch_s)) < len(imu):
+            imu[k:] += size * torch.randn(6, generator=g, dtype=torch.float64)
+        return replace(drive, imu=imu)
+
+    return change
+
+
 ERRORS: Mapping[str, Change] = {
     "none": lambda drive, g: drive,
     "positions: 3 m in one of ten": positions(0.1, 3.0),
@@ -149,6 +163,7 @@ ERRORS: Mapping[str, Change] = {
     "0.5 m/s², 5 °/s": biases(0.5, 5.0),
     "scale factors of the gyroscopes 1 % off": gyro_scale(0.01),
     "3 % off": gyro_scale(0.03),
+    "biases that step by 0.1 m/s², 0.15 °/s": bias_steps(0.1, 0.15),
 }
 OF_VELOCITIES, OF_IMU = [*ERRORS][9:12], [*ERRORS][12:16]
 SPIKED = 1 / 500

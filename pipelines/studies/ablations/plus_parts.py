@@ -38,6 +38,15 @@ class WithoutLevels(PlusFilter):
         return super().step(memory._replace(outage=outage), epoch)
 
 
+class WalksAsSet(PlusFilter):
+    """``plus`` whose biases walk as far as set, however their corrections are."""
+
+    def step(self, memory: PlusMemory, epoch: Epoch) -> tuple[PlusMemory, Correction]:
+        """With no sign in them."""
+        steps = memory.steps._replace(total=torch.zeros_like(memory.steps.total))
+        return super().step(memory._replace(steps=steps), epoch)
+
+
 class AsClaimed(PlusFilter):
     """``plus`` that takes all errors of fixes for white noise of the claimed 1σ."""
 
@@ -51,7 +60,7 @@ class AsClaimed(PlusFilter):
 
 def parts(folder: str) -> dict[str, Estimator]:
     """``plus`` with neither levels nor network, with one of them, with fixes as claimed, without one of its sources,
-    with Gaussian priors, and with constraints as set."""
+    with Gaussian priors, with constraints and with walks of the biases as set."""
     whole = trained_filter(folder)
     assert isinstance(whole, PlusFilter)
     found: dict[str, Estimator] = {}
@@ -61,6 +70,7 @@ def parts(folder: str) -> dict[str, Estimator]:
     bases = {"no speed from vibration": "+vibration_speed", "no delay and antenna": "+receiver"}
     kinds |= dict.fromkeys(bases, (PlusFilter, True))
     kinds |= {"Gaussian priors": (GaussianPriors, True), "constraints as set": (ConstraintsAsSet, True)}
+    kinds["walks as set"] = (WalksAsSet, True)
     for name, (kind, network) in kinds.items():
         config = replace(whole.config, base=whole.config.base.replace(bases.get(name, ""), ""))
         found[name] = part = kind(config).eval()

@@ -6,6 +6,7 @@ show it (:mod:`dlkf.filters.virtual_outages`), and it holds through an outage. A
 factor for each gyroscope every epoch, in outages too; it sees the samples, the filter's covariance and how well its
 innovations and corrections fit (:mod:`dlkf.filters.matching`). As far as fixes show, their errors are larger than
 claimed (:mod:`dlkf.filters.fix_noise`), or those of positions smaller, or wander (:mod:`dlkf.filters.position_errors`).
+The walk of a bias grows where its corrections keep their sign (:mod:`dlkf.filters.bias_steps`).
 The noise of the vehicle constraints is what innovations show (:mod:`dlkf.filters.constraint_noise`), and the prior of
 the vertical gyroscope's scale factor has heavy tails (:mod:`dlkf.filters.heavy_tails`). Before the first fix it is
 ``base`` to the bit; with fixes and constraints as claimed and weights of zero ``base`` with this prior until the first
@@ -26,6 +27,7 @@ from dlkf.base.errors import InputError
 from dlkf.base.settings import settings_from
 from dlkf.data.drive import Batch
 from dlkf.filters.advice import NetworkOutput
+from dlkf.filters.bias_steps import BiasSteps
 from dlkf.filters.branches import may_branch
 from dlkf.filters.build import build_filter
 from dlkf.filters.constraints import CarConstraints
@@ -111,6 +113,7 @@ class PlusMemory(NamedTuple):
     outage: VirtualOutage  # how much white noise there is
     errors: PositionErrors  # of the fixes
     fix_noise: FixNoise  # of those that claim too little
+    steps: BiasSteps  # whether a bias has changed
 
 
 class PlusFilter(nn.Module):
@@ -174,8 +177,9 @@ class PlusFilter(nn.Module):
         zero = zeros(B)
         outage = VirtualOutage.begin(kalman.P)
         matching, errors = Matching.begin(batch.imu, B), PositionErrors.begin(batch.imu, B)
-        fix_noise = FixNoise.begin(batch.imu, B, batch.start_noise)
-        return PlusMemory(kalman, self.network.start(B), zero, zero, matching, zero, outage, errors, fix_noise), error
+        fix_noise, steps = FixNoise.begin(batch.imu, B, batch.start_noise), BiasSteps.begin(batch.imu, B)
+        network = self.network.start(B)
+        return PlusMemory(kalman, network, zero, zero, matching, zero, outage, errors, fix_noise, steps), error
 
     def step(self, memory: PlusMemory, epoch: Epoch) -> tuple[PlusMemory, Correction]:
         """Network, the Kalman filter with the noise of both, then the virtual outage beside it."""
@@ -186,12 +190,12 @@ class PlusFilter(nn.Module):
         walk = torch.diag_embed(memory.errors.variance(offered))
         outage = memory.outage._replace(P=_add_walk(memory.outage.P, walk))
         memory = memory._replace(kalman=kalman._replace(P=_add_walk(kalman.P, walk)), outage=outage)
-        fixed = epoch.used.any(-1)
+        fixed, interval = epoch.used.any(-1), memory.since_fix + span
         with torch.no_grad():
             normalised = self._normalise_innovation(memory, epoch)
             memory = memory._replace(
                 elapsed=memory.elapsed + span,
-                since_fix=torch.where(fixed, 0.0, memory.since_fix + span),
+                since_fix=torch.where(fixed, 0.0, interval),
                 matching=memory.matching.update(normalised, epoch.used),
             )
             bands = window_features(epoch.corrected, epoch.dt)
@@ -205,8 +209,9 @@ class PlusFilter(nn.Module):
         if not (may_branch(seen) and bool(seen.all())):
             gyro_noise = torch.where(seen.unsqueeze(-1), gyro_noise, 1.0)
         (levels, weight), same = memory.outage.estimates(), torch.ones_like(gyro_noise)
+        walks = memory.steps.walk_factors()
         of_network, in_force = (
-            torch.stack((same, x, same, same), 1) for x in (gyro_noise, gyro_noise ** weight.unsqueeze(-1))
+            torch.cat((torch.stack((same, x), 1), walks), 1) for x in (gyro_noise, gyro_noise ** weight.unsqueeze(-1))
         )
         process = in_force * torch.cat((levels, levels.clamp_min(1.0)), -1).unsqueeze(-1)
         advice = NetworkOutput(process, memory.errors.noise(offered, kalman.fix.scale[0, 0, 0]))
@@ -216,19 +221,20 @@ class PlusFilter(nn.Module):
             after = epoch.window.end.correct(correction.dx)
             forward = (after.C_nb[:, :, 0] * after.v_n).sum(-1)
             matching, outage, errors = memory.matching, memory.outage, memory.errors
-            fix_noise = memory.fix_noise
+            fix_noise, steps = memory.fix_noise, memory.steps
             if (c := correction.covariances) is not None:
                 scale = source_scale(of_network, epoch.start.C_nb)
                 outage = outage.update(epoch, c, memory.kalman.windows, scale)
                 offering = c._replace(H=self.kalman.fix.matrix(claimed))  # before the gate
                 errors, fix_noise = errors.update(offered, offering), fix_noise.update(claimed, offering, outage)
                 matching = matching.update_ratios(c.dx, c.predicted, c.updated, epoch.window.end.C_nb, fixed)
+                steps = steps.update(c, interval, fixed)
         if correction.std is not None:
             correction = correction._replace(std=errors.add_slow_std(correction.std))
         correction = correction._replace(innovation=claimed.z, rejected=rejected)
         return memory._replace(
             kalman=kalman, hidden=hidden, matching=matching, outage=outage, errors=errors, fix_noise=fix_noise,
-            fix_speed=torch.where(fixed, forward, memory.fix_speed),
+            fix_speed=torch.where(fixed, forward, memory.fix_speed), steps=steps,
         ), correction  # fmt: skip
 
     def _normalise_innovation(self, memory: PlusMemory, epoch: Epoch) -> Float[Tensor, "B 6"]:
