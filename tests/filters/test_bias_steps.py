@@ -69,13 +69,14 @@ def test_epochs_without_a_fix_are_no_evidence():
     )
 
 
+@pytest.mark.whole
 def test_an_outage_after_a_step_is_bridged():
     """0.3 °/s or 0.3 m/s² a minute before an outage of 30 s, against the walks as set."""
-    batch, cars = slipping(4, 210, (0.0,) * 5), (slice(0, 2), slice(2, 4))
+    batch, cars = slipping(4, 140, (0.0,) * 5), (slice(0, 2), slice(2, 4))
     imu, available = batch.imu.clone(), torch.ones_like(batch.available)
-    imu[:2, 120:, :, 5] += math.radians(0.3)
-    imu[2:, 120:, :, 0] += 0.3
-    available[:, 180:] = False
+    imu[:2, 50:, :, 5] += math.radians(0.3)
+    imu[2:, 50:, :, 0] += 0.3
+    available[:, 110:] = False
     batch = replace(batch, imu=imu, available=available)
     filters = (trained_filter("plus"), parts("plus")["walks as set"])
     with torch.no_grad():
