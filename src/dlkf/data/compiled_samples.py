@@ -30,7 +30,7 @@ def compose(t: np.ndarray, columns: tuple[np.ndarray, ...], at: np.ndarray, usua
     return out
 
 
-@njit(inline="always")
+@njit()
 @no_type_check
 def second_order(a, b):
     """Of six numbers each: :func:`dlkf.data.increments.second_order`."""
@@ -44,28 +44,28 @@ def second_order(a, b):
     )
 
 
-@njit(inline="always")
+@njit()
 @no_type_check
 def six(x, k):
     """Row k of six columns."""
     return x[0][k], x[1][k], x[2][k], x[3][k], x[4][k], x[5][k]
 
 
-@njit(inline="always")
+@njit()
 @no_type_check
 def times(s, a):
     """s a."""
     return s * a[0], s * a[1], s * a[2], s * a[3], s * a[4], s * a[5]
 
 
-@njit(inline="always")
+@njit()
 @no_type_check
 def add(a, b):
     """a + b."""
     return a[0] + b[0], a[1] + b[1], a[2] + b[2], a[3] + b[3], a[4] + b[4], a[5] + b[5]
 
 
-@njit(inline="always")
+@njit()
 @no_type_check
 def _knot(t, n, usual, p):
     """Where segment p begins: one interval before the first, those of the samples, one after the last."""
@@ -77,7 +77,7 @@ def _knot(t, n, usual, p):
     return t[n - 1] + (t[n - 1] - t[n - 2] if n > 1 else first) if p == n + 2 else np.inf
 
 
-@njit(inline="always")
+@njit()
 @no_type_check
 def _integral(t, x, usual, k):
     """Length and integral of the interval that ends at sample k; what is missing has the mean of the two neighbours."""

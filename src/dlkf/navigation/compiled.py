@@ -152,42 +152,42 @@ def solve(S: Tensor, X: Tensor) -> Tensor:
     return out
 
 
-@njit(inline="always")
+@njit()
 @no_type_check
 def cross(a, b):
     """a × b of three numbers each, which stay in registers, as those of the functions below do."""
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
-@njit(inline="always")
+@njit()
 @no_type_check
 def dot(a, b):
     """a · b."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@njit(inline="always")
+@njit()
 @no_type_check
 def scale(s, a):
     """s a."""
     return s * a[0], s * a[1], s * a[2]
 
 
-@njit(inline="always")
+@njit()
 @no_type_check
 def plus(a, s, b):
     """a + s b."""
     return a[0] + s * b[0], a[1] + s * b[1], a[2] + s * b[2]
 
 
-@njit(inline="always")
+@njit()
 @no_type_check
 def row(x, b, k):
     """Vector x[b, k]."""
     return x[b, k, 0], x[b, k, 1], x[b, k, 2]
 
 
-@njit(inline="always")
+@njit()
 @no_type_check
 def rotation(phi):
     """exp([φ×]), a row each; up to 0.2 rad by the first terms of sine and cosine, which is all that float64 has."""
@@ -207,7 +207,7 @@ def rotation(phi):
     )
 
 
-@njit(inline="always")
+@njit()
 @no_type_check
 def times(a, R):
     """aᵀ R of a row and a matrix."""
@@ -218,7 +218,7 @@ def times(a, R):
     )
 
 
-@njit(inline="always")
+@njit()
 @no_type_check
 def gains(phi, f, dt):
     """∫ exp(s φ) ds f dt over a sample, once for velocity and twice for position (over dt)."""

@@ -30,7 +30,7 @@ def adjoint(
     return p0, v0, turn, samples
 
 
-@njit(inline="always")
+@njit()
 @no_type_check
 def _rotate_back(A, k, u):
     """A[k]ᵀ u."""

@@ -21,7 +21,7 @@ def transition(
     return Phi
 
 
-@njit(inline="always")
+@njit()
 @no_type_check
 def add(total, s, x):
     """total ← total + s x of rows of any length."""
