@@ -10,7 +10,7 @@ The walk of a bias grows where its corrections keep their sign (:mod:`dlkf.filte
 The noise of the vehicle constraints is what innovations show (:mod:`dlkf.filters.constraint_noise`), and the prior of
 the vertical gyroscope's scale factor has heavy tails (:mod:`dlkf.filters.heavy_tails`). Before the first fix it is
 ``base`` to the bit; with fixes and constraints as claimed and weights of zero ``base`` with this prior until the first
-virtual outage was scored.
+virtual outage was scored or corrections of a bias have kept their sign.
 """
 
 from __future__ import annotations
