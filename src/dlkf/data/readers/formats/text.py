@@ -9,7 +9,8 @@ import re
 import warnings
 import zlib
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -84,11 +85,9 @@ def decode_text(path: Path, encoding: str | None) -> str:
         return raw.decode("utf-16", errors="replace")
     if b"\0" in raw[:4096]:
         raise InputError(f"{path}: is no text file; set its format (reader.imu.format, reader.gnss.format)")
-    for name in ("utf-8-sig", *_likely_encodings(raw[:PEEK])):
-        try:
+    for name in _likely_encodings(raw[:PEEK]):
+        with suppress(UnicodeDecodeError):
             return raw.decode(name)
-        except UnicodeDecodeError:
-            continue
     return raw.decode("latin-1")
 
 
@@ -111,14 +110,16 @@ def make_frame(
     return pd.DataFrame(list(cells), index=pd.Index(numbers)), notes
 
 
-def _likely_encodings(head: bytes) -> list[str]:
-    """The encodings of Windows, first that in which most letters beyond ASCII are those of columns' names."""
+def _likely_encodings(head: bytes) -> Iterator[str]:
+    """UTF-8, then the encodings of Windows, first that in which most letters beyond ASCII are those of columns'
+    names."""
+    yield "utf-8-sig"
 
     def known(name: str) -> float:
         letters = [x for x in head.decode(name, errors="replace") if not x.isascii()]
         return sum(x in vocabulary.LETTERS for x in letters) / max(len(letters), 1)
 
-    return sorted(ENCODINGS, key=known, reverse=True)
+    yield from sorted(ENCODINGS, key=known, reverse=True)
 
 
 def _unpack(path: Path) -> bytes:
