@@ -20,6 +20,7 @@ from dlkf.base.files import (
     resolve_place,
     write_into,
 )
+from dlkf.data.schema import remove_drive
 from dlkf.data.store import load_dataset
 from dlkf.data.tables import dataset_digest, read_drives
 from dlkf.data.validate import validate_dataset
@@ -82,6 +83,13 @@ def test_a_dataset_of_a_store(town, store):
     assert dataset_digest(there) == dataset_digest(town)
     here, far = (load_dataset(folder, rate_hz=50, drives=["car-1"])[0] for folder in (town, there))
     assert (here.imu == far.imu).all() and far.dataset == folder_name(store) == "new"
+
+
+def test_a_drive_is_removed_from_a_store(town, store):
+    there = copied(town, store)
+    before = files(there)
+    remove_drive(there, "car-1")
+    assert files(there) == [x for x in before if "drive=car-1/" not in x] != before
 
 
 def test_whole_or_none(town, store):

@@ -31,7 +31,6 @@ APART_S = 0.6  # more is another clock, less a delay, which the filter estimates
 CLEARLY = 0.4  # of the difference that is left at another lag, for that lag to be the right one
 SQUARE_DEG = 30.0  # a heading so far from the course is that of antennas mounted otherwise
 PRESSURE_PA = (3e4, 1.2e5)
-DROP = "; leave it out with aids=[]"
 
 
 def check_aid(name: str, table: Columns, imu: Columns, moved: Motion, where: str) -> None:
@@ -44,7 +43,7 @@ def check_aid(name: str, table: Columns, imu: Columns, moved: Motion, where: str
         raise InputError(f"{where}: {rate:.3g} rows a second: t is not in seconds; give t in seconds")
     refuse_rows(table, values, np.isinf, where, "write NaN where unknown")
     if not np.any([np.isfinite(table[c]) for c in values]):
-        raise InputError(f"{where}: {' and '.join(values)} is NaN in every row" + DROP)
+        raise InputError(f"{where}: {' and '.join(values)} is NaN in every row; {_leaving_out(name)}")
     refuse_rows(table, table.keys() & {"std"}, lambda x: x < 0, where, "must be ≥ 0, or NaN if unknown")
     if not ((t > imu["t"][0]) & (t <= imu["t"][-1] + 1)).any():
         raise InputError(
@@ -59,6 +58,10 @@ def check_aid(name: str, table: Columns, imu: Columns, moved: Motion, where: str
         _check_baro(table, where)
 
 
+def _leaving_out(name: str) -> str:
+    return f"leave it out (reader.{name}.file=null in ingest, an aids= without {name} elsewhere)"
+
+
 def _check_speed(table: Columns, moved: Motion, where: str) -> None:
     known = np.isfinite(table["speed"])
     t, v = table["t"][known], table["speed"][known]
@@ -70,7 +73,7 @@ def _check_speed(table: Columns, moved: Motion, where: str) -> None:
     if np.ptp(wheel[fast]) == 0 and np.ptp(ground) > FAST:
         raise InputError(
             f"{where}: speed stays {wheel[0]:g} m/s though the car moves at up to {ground.max():.0f} m/s: the sensor "
-            "is dead" + DROP
+            f"is dead; {_leaving_out('speed')}"
         )
     lag_s = _lag(t, v, at, ground)
     if abs(lag_s) > APART_S:

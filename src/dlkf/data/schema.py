@@ -30,7 +30,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from dlkf.base.errors import InputError
-from dlkf.base.files import replace_file, replace_folder, require_empty, resolve_place
+from dlkf.base.files import is_url, replace_file, replace_folder, require_empty, resolve_place
 
 F, I, B = pa.float64(), pa.int8(), pa.bool_()
 ACCEL = ("accel_x", "accel_y", "accel_z")
@@ -192,7 +192,11 @@ def _rate(t: pd.Series) -> float:
 def remove_drive(folder: str | Path, name: str) -> None:
     """Delete the tables of a drive that :func:`write_drive` wrote."""
     for kind in resolve_place(folder).iterdir():
-        shutil.rmtree(kind / f"drive={name}", ignore_errors=True)
+        drive: Any = kind / f"drive={name}"
+        if is_url(drive) and drive.exists():
+            drive.fs.rm(drive.path, recursive=True)
+        elif not is_url(drive):
+            shutil.rmtree(drive, ignore_errors=True)
 
 
 def way_with_imu(frame: pd.DataFrame, imu: pd.DataFrame) -> pd.DataFrame:

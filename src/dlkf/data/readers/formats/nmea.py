@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Iterator, Mapping
+from datetime import date
 from pathlib import Path
 from typing import Any
 
@@ -40,17 +41,17 @@ def aids(path: Path) -> tuple[str, ...]:
 def headings(messages: Iterator[Any], where: str) -> pd.DataFrame:
     """HDT and THS, which have no time: each is of the sentence with one before it."""
     rows: list[dict[str, Any]] = []
-    date: int | None = None
+    day: int | None = None
     of_day: int | None = None
     for m in messages:
         if m.msgID in ("RMC", "ZDA"):
-            date = _day(m) or date
+            day = _day(m) or day
         of_day = of_day if (stamp := _day_ns(getattr(m, "time", None))) is None else stamp
         if m.msgID not in ("HDT", "THS") or of_day is None or getattr(m, "mi", "A") not in ("A", "E"):
             continue
         angle = _float(getattr(m, "headingT", getattr(m, "headt", "")))
         if np.isfinite(angle) and not (rows and rows[-1]["of_day"] == of_day):
-            rows.append({"of_day": of_day, "date": date, "heading_deg": angle})
+            rows.append({"of_day": of_day, "date": day, "heading_deg": angle})
     frame = pd.DataFrame(rows)
     if frame.empty or frame["date"].isna().all():
         raise InputError(f"{where}: has no HDT or THS sentence with a date (RMC or ZDA); set reader.heading.file=null")
@@ -74,15 +75,15 @@ def sentences(content: bytes) -> Iterator[Any]:
 
 
 def fixes(messages: Iterator[Any], where: str) -> pd.DataFrame:
-    """Epochs of equal time of day; the date is that of RMC or ZDA, and goes on over midnight."""
+    """Epochs of equal time of day, with the date of RMC or ZDA."""
     rows: list[dict[str, Any]] = []
-    date: int | None = None  # nanoseconds of the day's beginning
+    day: int | None = None  # nanoseconds of its beginning
     seen: str | None = None
     for m in messages:
         time = getattr(m, "time", None)
         stamp = _day_ns(time)
-        if m.msgID in ("RMC", "ZDA") and (day := _day(m)) is not None:
-            date = day
+        if m.msgID in ("RMC", "ZDA"):
+            day = _day(m) or day
         if m.msgID == "VTG":  # carries no time: it belongs to the epoch that is open
             if rows and "vel_n" not in rows[-1]:
                 _set_velocity(rows[-1], m.sogn, m.cogt)
@@ -93,7 +94,7 @@ def fixes(messages: Iterator[Any], where: str) -> pd.DataFrame:
         if not rows or rows[-1]["of_day"] != stamp:
             rows.append({"of_day": stamp})
         row = rows[-1]
-        row["date"] = date
+        row["date"] = day
         if m.msgID == "GGA" or (m.msgID == "GNS" and "lat_deg" not in row):
             if m.lat not in ("", None):
                 row |= {"lat_deg": m.lat, "lon_deg": m.lon, "quality": _quality(m)}
@@ -117,18 +118,20 @@ def fixes(messages: Iterator[Any], where: str) -> pd.DataFrame:
 def _quality(m: Any) -> int:
     """NMEA GGA code of a GGA, or of the best constellation of a GNS."""
     if m.msgID == "GGA":
-        return int(m.quality)
+        return int(m.quality or 0)
     codes = {MODES.get(letter, 0) for letter in str(m.posMode)} | {0}
     return next(code for code in BEST if code in codes)
 
 
-def _stamps(of_day: np.ndarray, date: pd.Series) -> np.ndarray:
-    """Time of day and the first date that is known, days counted on at each midnight."""
+def _stamps(of_day: np.ndarray, day: pd.Series) -> np.ndarray:
+    """Time of day on the day of the last new date, counted on at each midnight since: a receiver may tell the date
+    some rows after midnight, and a log may hold several recordings. Rows before the first date count back from it."""
     turns = np.concatenate(([0], np.cumsum(np.diff(of_day) < -DAY_NS // 2)))
-    known = int(np.flatnonzero(date.notna())[0])
-    # a date read at row k belongs to the day of that row
-    first = int(date.iloc[known]) - int(turns[known]) * DAY_NS
-    return first + turns * DAY_NS + of_day
+    days = day.bfill().ffill().to_numpy(np.int64)
+    new = np.flatnonzero(np.diff(days, prepend=days[0] - 1))
+    known = np.where(new == 0, int(day.notna().argmax()), new)  # the row at which a date was read
+    last = np.searchsorted(new, np.arange(len(days)), side="right") - 1
+    return days + (turns - turns[known[last]]) * DAY_NS + of_day
 
 
 def _set_velocity(row: dict[str, Any], knots: Any, course: Any) -> None:
@@ -149,11 +152,11 @@ def _day_ns(time: Any) -> int | None:
 
 
 def _day(m: Any) -> int | None:
-    if m.msgID == "ZDA":
-        date = f"{int(m.year):04d}-{int(m.month):02d}-{int(m.day):02d}" if m.year else None
-    else:
-        date = m.date.isoformat() if hasattr(m.date, "isoformat") else None
-    return None if date is None else int(np.datetime64(date, "ns").astype(np.int64))
+    try:
+        day = date(int(m.year), int(m.month), int(m.day)) if m.msgID == "ZDA" else m.date
+        return int(np.datetime64(day.isoformat(), "ns").astype(np.int64))
+    except (AttributeError, TypeError, ValueError):  # empty cells
+        return None
 
 
 def _float(value: Any) -> float:

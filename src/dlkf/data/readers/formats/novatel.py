@@ -9,7 +9,9 @@ fixes have the contract's columns (BESTPOS with BESTVEL), INSPVA those of a refe
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +29,7 @@ IMUS = ("RAWIMUS", "RAWIMU", "RAWIMUSX", "RAWIMUX")
 COMPUTED = "SOL_COMPUTED"
 EXACT_S = 1e-3  # between the times of a velocity and of a position that are the same
 LONGEST_STEP = 1.5  # usual ones between velocities that are interpolated
+Rows = list[tuple[int, float, list[str]]]  # of a log: week, seconds of the week, cells
 SIZES = {"RAWIMUSX": 2, "RAWIMUX": 2}  # IMU info and type stand before week and seconds
 
 
@@ -120,25 +123,39 @@ def _days(texts: pd.Series, mark: str, where: str) -> np.ndarray:
 
 
 def _logs(lines: list[str], path: Path, kind: str, table: str | None) -> LogTable:
-    logs: dict[str, list[tuple[int, float, list[str]]]] = {}
-    for line in lines:
-        if not (found := LOG.match(line)):
-            continue
-        header = found[2].split(",")
-        week, sow = (header[0], header[1]) if line.startswith("%") else (header[4], header[5])
-        logs.setdefault(found[1], []).append((int(week), float(sow), found[3].split(",")))
+    logs, notes = _rows_by_log(lines, path)
     have = ", ".join(f"{name} ({len(rows)})" for name, rows in logs.items())
     if kind == "imu":
         name = table or next((n for n in IMUS if n in logs), None)
         if name is None or name not in logs:
             raise InputError(f"{path}: no log {name or ', '.join(IMUS)}; has {have}; set reader.imu.table")
-        return LogTable(_imu(logs[name], SIZES.get(name, 0)), path, "log")
+        return LogTable(_imu(logs[name], SIZES.get(name, 0)), path, "log", notes)
     if table == "INSPVA" or (kind == "reference" and "INSPVA" in logs):
-        return LogTable(_inspva(logs.get("INSPVA") or _refuse_absent(path, "INSPVA", have)), path, "log")
+        return LogTable(_inspva(logs.get("INSPVA") or _refuse_absent(path, "INSPVA", have)), path, "log", notes)
     positions = logs.get("BESTPOS") or _refuse_absent(path, "BESTPOS", have)
     fixes, late_s = _join_best(positions, logs.get("BESTVEL", []))
     said = f"velocities are up to {late_s:.3g} s older than their stamps (latency of BESTVEL) and were interpolated to"
-    return LogTable(fixes, path, "log", (f"{said} those of the positions",) if late_s > EXACT_S else ())
+    late = (f"{said} those of the positions",) if late_s > EXACT_S else ()
+    return LogTable(fixes, path, "log", (*notes, *late))
+
+
+def _rows_by_log(lines: list[str], path: Path) -> tuple[dict[str, Rows], tuple[str, ...]]:
+    """The rows of each log, and a note on lines that are left out: with a damaged header, without the checksum that
+    others have, or with fewer cells than most of their log."""
+    found = [match for line in lines if (match := LOG.match(line))]
+    checked = any(match[4] for match in found)
+    logs: dict[str, Rows] = {}
+    for match in found:
+        header = match[2].split(",")
+        with suppress(IndexError, ValueError):
+            week, sow = header[:2] if match[0].startswith("%") else (header[4], header[5])
+            if match[4] or not checked:
+                logs.setdefault(match[1], []).append((int(week), float(sow), match[3].split(",")))
+    for name, rows in logs.items():
+        usual = Counter(len(cells) for *_, cells in rows).most_common(1)[0][0]
+        logs[name] = [row for row in rows if len(row[2]) >= usual]
+    damaged = len(found) - sum(map(len, logs.values()))
+    return logs, (f"{path.name}: {damaged} damaged or cut line{'s' * (damaged > 1)} left out",) if damaged else ()
 
 
 def _refuse_absent(path: Path, name: str, have: str) -> Any:
@@ -156,9 +173,6 @@ def _imu(rows: list[tuple[int, float, list[str]]], skip: int) -> pd.DataFrame:
     for axis, (k, sign) in signs.items():
         out[f"accel_{axis}"], out[f"gyro_{axis}"] = sign * values[:, k], sign * values[:, 3 + k]
     return pd.DataFrame(out)
-
-
-Rows = list[tuple[int, float, list[str]]]  # of a log: week, seconds of the week, cells
 
 
 def _join_best(positions: Rows, speeds: Rows) -> tuple[pd.DataFrame, float]:

@@ -106,44 +106,51 @@ def _messages(path: Path, changed: int) -> tuple[list[Any], int]:
 
 
 def _fixes(messages: list[Any]) -> pd.DataFrame:
-    """NAV-PVT, with the digits of NAV-HPPOSLLH and the standard deviations of NAV-COV of the same iTOW."""
+    """NAV-PVT, with the digits of NAV-HPPOSLLH and the standard deviations of NAV-COV of the same time."""
     rows: dict[int, dict[str, float]] = {}
-    fine = {m.iTOW: m for m in messages if m.identity == "NAV-HPPOSLLH" and not m.invalidLlh}
-    spread = {m.iTOW: m for m in messages if m.identity == "NAV-COV"}
-    for m in messages:
-        if m.identity != "NAV-PVT" or not (m.validDate and m.validTime) or (stamp := _gps_ns(m)) is None:
+    stamped = list(_stamps(messages))
+    fine = {stamp: m for stamp, m in stamped if m.identity == "NAV-HPPOSLLH" and not m.invalidLlh}
+    spread = {stamp: m for stamp, m in stamped if m.identity == "NAV-COV"}
+    for stamp, m in stamped:
+        if m.identity != "NAV-PVT" or not (m.validDate and m.validTime):
             continue
         position = (m.lat, m.lon, m.height / 1000)
-        if (hp := fine.get(m.iTOW)) is not None:  # pyubx2 scales: degrees, mm, the high-precision part added
+        if (hp := fine.get(stamp)) is not None:  # pyubx2 scales: degrees, mm, the high-precision part added
             position = (hp.lat, hp.lon, hp.height / 1000)
         std_n = std_e = m.hAcc / 1000 / np.sqrt(2)
         stds = [std_n, std_e, m.vAcc / 1000, *[m.sAcc / 1000 / np.sqrt(3)] * 3]
-        if (cov := spread.get(m.iTOW)) is not None and cov.posCovValid:
+        if (cov := spread.get(stamp)) is not None and cov.posCovValid:
             stds[:3] = [float(np.sqrt(max(x, 0.0))) for x in (cov.posCovNN, cov.posCovEE, cov.posCovDD)]
             if cov.velCovValid:
                 stds[3:] = [float(np.sqrt(max(x, 0.0))) for x in (cov.velCovNN, cov.velCovEE, cov.velCovDD)]
         row: dict[str, float] = dict(zip(POSITION, position))
         row |= dict(zip(VELOCITY, (m.velN / 1000, m.velE / 1000, m.velD / 1000)))
         row |= dict(zip(STD, stds)) | {"t_ns": stamp, "quality": _quality(m)}
-        rows[m.iTOW] = row
+        rows[stamp] = row
     return pd.DataFrame(list(rows.values()))
 
 
-def _gps_ns(m: Any) -> int | None:
-    """GPS time of a NAV-PVT: iTOW in the week of its date; None for a date that is none."""
+def _stamps(messages: list[Any]) -> Iterator[tuple[int, Any]]:
+    """Messages with an iTOW and their GPS nanoseconds, in the week of the last NAV-PVT with a date, at the beginning
+    of the first."""
+    weeks = [_week(m) if m.identity == "NAV-PVT" else None for m in messages]
+    week = next((found for found in weeks if found is not None), None)
+    for m, found in zip(messages, weeks):
+        week = week if found is None else found
+        if week is not None and hasattr(m, "iTOW"):
+            yield (week * WEEK_S * 1000 + m.iTOW) * 10**6, m
+
+
+def _week(m: Any) -> int | None:
+    """GPS week of a NAV-PVT by its date; None where that is not valid."""
+    if not (m.validDate and m.validTime and 1980 <= m.year < 2100):
+        return None
     try:
         date = np.datetime64(f"{m.year:04d}-{m.month:02d}-{m.day:02d}T{m.hour:02d}:{m.min:02d}:{min(m.second, 59):02d}")
     except ValueError:
         return None
-    if not 1980 <= m.year < 2100:
-        return None
     gps = int(gps_seconds(date.astype("datetime64[s]").astype(np.int64)))
-    return _gps_from_tow(round((gps - m.iTOW / 1000) / WEEK_S), m)
-
-
-def _gps_from_tow(week: int, m: Any) -> int:
-    """GPS nanoseconds of a message's iTOW."""
-    return week * WEEK_S * 10**9 + m.iTOW * 10**6
+    return round((gps - m.iTOW / 1000) / WEEK_S)
 
 
 def _quality(m: Any) -> int:
@@ -178,14 +185,12 @@ def _wheels(messages: list[Any], name: str) -> pd.DataFrame:
 
 
 def _headings(messages: list[Any]) -> pd.DataFrame:
-    """NAV-RELPOSNED of a moving base: where its heading is valid, with the week of the NAV-PVT before."""
-    rows, week = [], None
-    for m in messages:
-        if m.identity == "NAV-PVT" and (stamp := _gps_ns(m)) is not None:
-            week = stamp // (WEEK_S * 10**9)
-        if m.identity == "NAV-RELPOSNED" and week is not None and getattr(m, "relPosHeadingValid", 0):
-            rows.append({"t_ns": _gps_from_tow(week, m), "heading_deg": m.relPosHeading, "std_deg": m.accHeading})
-    return pd.DataFrame(rows)
+    """NAV-RELPOSNED of a moving base, where its heading is valid."""
+    return pd.DataFrame(
+        {"t_ns": stamp, "heading_deg": m.relPosHeading, "std_deg": m.accHeading}
+        for stamp, m in _stamps(messages)
+        if m.identity == "NAV-RELPOSNED" and getattr(m, "relPosHeadingValid", 0)
+    )
 
 
 def _collect_complete(messages: list[Any], name: str, kinds: Collection[int]) -> tuple[np.ndarray, np.ndarray]:
@@ -198,8 +203,8 @@ def _collect_complete(messages: list[Any], name: str, kinds: Collection[int]) ->
     arrived: dict[int, int] = {}
     now, last, turns = None, None, 0
     for m in messages:
-        if m.identity == "NAV-PVT":
-            now = _gps_ns(m) or now
+        if m.identity == "NAV-PVT" and (week := _week(m)) is not None:
+            now = (week * WEEK_S * 1000 + m.iTOW) * 10**6
         if m.identity != name or now is None:
             continue
         for value, sensor, tag in _values(m, name):
