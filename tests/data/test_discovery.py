@@ -20,7 +20,7 @@ from dlkf.data.discovery.motion import find_motion, integrate_level, position_de
 from dlkf.data.discovery.orientation import find_pose
 from dlkf.data.discovery.units import accel_units, nearest_unit, time_unit, unit_left
 from dlkf.data.intake import ingest_drives
-from dlkf.data.plausibility import check_clocks, describe_delay, describe_rotation
+from dlkf.data.plausibility import check_clocks, describe_clocks
 from dlkf.data.readers import units
 from dlkf.data.readers.auto import AutoReader
 from dlkf.data.readers.frames import DriveFrames
@@ -341,14 +341,15 @@ def test_units_by_size():
 @pytest.mark.parametrize("late_s, said", [(0.0, ""), (0.15, ""), (0.5, "0.5 s later"), (-0.7, "0.7 s earlier")])
 def test_fixes_that_are_late_get_a_line(streets, late_s, said):
     imu, gnss = ({k: v.to_numpy() for k, v in streets[kind].items()} for kind in ("imu", "gnss"))
-    line = describe_delay(imu, {**gnss, "t": gnss["t"] + late_s})
-    assert line is None if not said else said in line
+    lines = describe_clocks(imu, {**gnss, "t": gnss["t"] + late_s})
+    assert lines == [] if not said else said in lines[0]
 
 
 def test_a_sensor_that_seems_turned_gets_a_line(streets):
     """By 75° about the vertical; the line asks for less than the check that refuses, none as the drive is."""
     imu, gnss = ({k: v.to_numpy() for k, v in streets[kind].items()} for kind in ("imu", "gnss"))
-    assert describe_rotation(imu, gnss) is None
+    assert describe_clocks(imu, gnss) == []
     turn = Rotation.from_euler("Z", 75.0, degrees=True).as_matrix()
     turned = {**imu, **dict(zip(ACCEL, turn @ np.stack([imu[c] for c in ACCEL])))}
-    assert "turned by" in (describe_rotation(turned, gnss) or "")
+    (line,) = describe_clocks(turned, gnss)
+    assert "turned by" in line

@@ -101,7 +101,7 @@ def test_row_by_row_is_as_the_whole_table():
     rows = zip(*(gnss[c] for c in ("t", *POSITION)), strict=True)
     reasons = [screen.find_refusal(t, place, 10.0, np.full(6, 0.05)) for t, *place in rows]
     assert [k for k, reason in enumerate(reasons) if reason] == refused(gnss)
-    assert all("no car moves so far" in r for r in reasons if r)
+    assert all("implausible jump" in r for r in reasons if r)
 
 
 def write(folder, tables, **meta):

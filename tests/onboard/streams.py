@@ -27,10 +27,10 @@ SCALE = np.array([METRES.get(c, 1.0) for c in SOLUTION])
 SAID = {  # the reasons of the Python stream in words of the core
     "0°/0°": "implausible_fix", "lies outside": "implausible_fix", "any car": "implausible_fix",
     "1σ beyond": "implausible_fix", "frozen rec": "implausible_fix",
-    "frozen IMU": "frozen", "no car": "implausible_fix",
+    "frozen IMU": "frozen", "jump": "implausible_fix",
     "finite": "not_finite", " is inf": "not_finite", " is nan": "not_finite", "beyond": "implausible",
-    "again": "double", "goes back": "back", "gap": "gap", "no fix": "no_fix", "outside": "outside", "std": "outside",
-    "late": "late", "ahead": "ahead", "takes no": "no_sensor",
+    "duplicate": "double", "goes back": "back", "gap": "gap", "no fix": "no_fix", "outside": "outside",
+    "std": "outside", "late": "late", "ahead": "ahead", "takes no": "no_sensor",
 }  # fmt: skip
 
 

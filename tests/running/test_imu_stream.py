@@ -61,7 +61,7 @@ def test_what_is_out_of_line_is_refused_and_believed_when_it_goes_on():
 
     s = stream()
     still = (0.0, 0.0, -9.8), (0.0, 0.0, 0.0)
-    assert "again" in s.find_refusal(5.0, *still) and "goes back" in s.find_refusal(3.0, *still)
+    assert "duplicate" in s.find_refusal(5.0, *still) and "goes back" in s.find_refusal(3.0, *still)
     assert "gap of 4.000 s" in s.find_refusal(9.0, *still) and not s.lost
     assert s.find_refusal(5.01, *still) == "" and not s.lost  # the line goes on
     for t in 2.0 + np.arange(90) / 100:

@@ -125,13 +125,13 @@ def align_boundaries(drive: Drive, config: AlignConfig = ALIGN) -> Aligned:
     ok &= span > 0.5 * drive.epoch_s
     span = span.clamp_min(0.5 * drive.epoch_s)
 
-    # velocity of the IMU in n at both ends: the antenna's less the swing of the lever arm
-    swing_b = torch.linalg.cross(rate_b, drive.lever_arm_b.expand_as(rate_b))
+    # velocity of the IMU in n at both ends: the antenna's less the lever-arm velocity ω × l
+    arm_velocity_b = torch.linalg.cross(rate_b, drive.lever_arm_b.expand_as(rate_b))
     speed = v_n[:, :2].norm(dim=-1)
-    slip = torch.asin((swing_b[:, 1] / speed.clamp_min(0.1)).clamp(-0.9, 0.9))
+    slip = torch.asin((arm_velocity_b[:, 1] / speed.clamp_min(0.1)).clamp(-0.9, 0.9))
     yaw = torch.atan2(v_n[:, 1], v_n[:, 0]) - slip + lag * rate_b[:, 2]
     C_level = rotation_from_rpy(torch.stack((torch.zeros_like(yaw), torch.zeros_like(yaw), yaw), -1))
-    v_imu = v_n - (C_level @ swing_b.unsqueeze(-1)).squeeze(-1)
+    v_imu = v_n - (C_level @ arm_velocity_b.unsqueeze(-1)).squeeze(-1)
     swing_then = torch.linalg.cross(rate_b[then], drive.lever_arm_b.expand_as(rate_b))
     v_then = v_n[then] - (C_level @ turned @ swing_then.unsqueeze(-1)).squeeze(-1)
     acceleration = (v_imu - v_then) / span.unsqueeze(-1)

@@ -15,7 +15,7 @@ import yaml
 from dlkf.base.errors import InputError
 from dlkf.base.files import absolute_place, is_url, replace_file
 from dlkf.base.parallel import check_engine, parallel_map
-from dlkf.data.plausibility import describe_delay, describe_drift, describe_rotation
+from dlkf.data.plausibility import describe_clocks
 from dlkf.data.readers.frames import DriveFrames, Place
 from dlkf.data.readers.settling import Unsure
 from dlkf.data.readers.sharing import agrees, layout, list_settings, pool_settings
@@ -52,9 +52,9 @@ class IngestOptions:
                 rows.append(write_drive(folder, part.meta, part.imu, part.gnss, part.reference, part.aids))
                 if part.gnss is not None:
                     tables = read_drive(folder, DriveRow(part.name, part.name, (0.0, 0.0, 0.0)), limits=self.limits)
-                    for check in (describe_cover, describe_drift, describe_delay, describe_rotation):
-                        if line := check(tables.imu, read_fixes(tables.gnss)):
-                            detail.append(f"{part.name}: {line}")
+                    fixes = read_fixes(tables.gnss)
+                    said = [describe_cover(tables.imu, fixes), *describe_clocks(tables.imu, fixes)]
+                    detail += [f"{part.name}: {line}" for line in said if line]
                 else:
                     read_imu(folder, part.name, self.limits)
                 lines.append(f"{part.name}: {drive_line(part)}")

@@ -134,7 +134,7 @@ class FixScreen:
             self._others, self._other = 0, None
             return self._take(fix)
         climb, dt = height - self._good.height_m, abs(t - self._good.t)
-        return f"{way:.0f} m off and {climb:+.0f} m up in {dt:.1f} s: no car moves so far"
+        return f"{way:.0f} m off and {climb:+.0f} m up in {dt:.1f} s: implausible jump"
 
     def _take(self, fix: GoodFix) -> str:
         self._good = fix

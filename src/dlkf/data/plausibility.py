@@ -71,8 +71,8 @@ def check_imu_units(imu: Columns, where: str) -> None:
     if axes[2] > UPRIGHT * size:
         raise InputError(
             f"{where}: accel_z is {axes[2]:+.2f} m/s² in the median, must be about −9.8 (Forward-Right-"
-            "Down); the z axis points up (FLU?): reader.imu.accel.axes=flu and gyro.axes=flu, or turn the signs of y "
-            "and z of accel and gyro round"
+            "Down); the z axis points up (FLU?): reader.imu.accel.axes=flu and gyro.axes=flu, or negate y and z of "
+            "accel and gyro"
         )
     if axes[2] > -UPRIGHT * size:
         k = int(np.abs(axes).argmax())
@@ -306,10 +306,18 @@ def _check_drift(imu: ImuSums, gnss: Motion, where: str) -> None:
     )
 
 
-def describe_drift(imu: Columns, gnss: Columns) -> str | None:
-    """A line about clocks that drift apart by less than :func:`check_clocks` refuses; None where none is found."""
-    moved = find_motion(gnss)
-    ends = compare_ends(ImuSums.of_table(imu), moved)
+def describe_clocks(imu: Columns, gnss: Columns) -> list[str]:
+    """Lines about what :func:`check_clocks` does not refuse yet: clocks that drift apart, fixes that are late or early,
+    a sensor that seems turned."""
+    moved, sums = find_motion(gnss), ImuSums.of_table(imu)
+    lines = [_describe_drift(imu, sums, moved)]
+    if (best := find_lag(sums, moved, APART_S)) is not None:
+        lines += [_describe_delay(best), _describe_rotation(best)]
+    return [line for line in lines if line]
+
+
+def _describe_drift(imu: Columns, sums: ImuSums, moved: Motion) -> str | None:
+    ends = compare_ends(sums, moved)
     span = float(moved.t[-1] - moved.t[0]) if len(moved.t) else 0.0
     if span < SHORTEST_S or (ends is not None and abs(ends.drift) * span < DRIFTED_S - ROUGH_S):
         return None
@@ -324,10 +332,8 @@ def describe_drift(imu: Columns, gnss: Columns) -> str | None:
     )
 
 
-def describe_delay(imu: Columns, gnss: Columns) -> str | None:
-    """A line about fixes that are late or early by less than :func:`check_clocks` refuses; None where none is found."""
-    best = find_lag(ImuSums.of_table(imu), find_motion(gnss), APART_S)
-    if best is None or not best.certain or abs(best.peak_s) < LATE_S:
+def _describe_delay(best: Lag) -> str | None:
+    if not best.certain or abs(best.peak_s) < LATE_S:
         return None
     side = "later" if best.peak_s < 0 else "earlier"
     return (
@@ -337,10 +343,8 @@ def describe_delay(imu: Columns, gnss: Columns) -> str | None:
     )
 
 
-def describe_rotation(imu: Columns, gnss: Columns) -> str | None:
-    """A line about a sensor that seems turned, where it is not so clear that :func:`check_clocks` refuses it."""
-    best = find_lag(ImuSums.of_table(imu), find_motion(gnss), APART_S)
-    if best is None or not best.clear or not min(best.yaw, best.force) > 0.6:
+def _describe_rotation(best: Lag) -> str | None:
+    if not best.clear or not min(best.yaw, best.force) > 0.6:
         return None
     turned = np.degrees(best.angle)
     if not TURNED_DEG[0] < abs(turned) < TURNED_DEG[1]:

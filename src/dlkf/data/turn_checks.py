@@ -43,8 +43,7 @@ def check_turns(imu: Columns, fixes: Columns, where: str) -> None:
     if slope < 0:
         mirrored = "" if by_velocities else "; or latitude and longitude are exchanged, or one has the wrong sign"
         raise InputError(
-            f"{where}: gyro_z turns against the course (slope {slope:.2f}): z must point down; "
-            f"turn the signs of y and z{mirrored}"
+            f"{where}: gyro_z turns against the course (slope {slope:.2f}): z must point down; negate y and z{mirrored}"
         )
     small = np.abs(turned) <= np.median(np.abs(turned))  # right even if sharp ones are beyond its limit
     scales = slope, float(np.median(gyro[small] / turned[small]))

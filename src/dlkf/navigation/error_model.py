@@ -231,8 +231,8 @@ def antenna(
     """
     if lever_arm_b is None:
         return torch.cat((state.p_n, state.v_n), -1)
-    arm_n, swing_n = _rotate_arm(state, rate_b, lever_arm_b)
-    velocity = state.v_n + swing_n - torch.linalg.cross(frame.earth_rate_n, arm_n)
+    arm_n, arm_velocity_n = _rotate_arm(state, rate_b, lever_arm_b)
+    velocity = state.v_n + arm_velocity_n - torch.linalg.cross(frame.earth_rate_n, arm_n)
     return torch.cat((state.p_n + arm_n, velocity), -1)
 
 
@@ -246,9 +246,9 @@ def measurement_matrix(
     """H of antenna position and velocity with the lever arm in it (paper.md 2.5)."""
     H = _identity(states, rate_b.dtype, rate_b.device) + rate_b.new_zeros(len(rate_b), 1, 1)
     if lever_arm_b is not None:
-        arm_n, swing_n = _rotate_arm(state, rate_b, lever_arm_b)
+        arm_n, arm_velocity_n = _rotate_arm(state, rate_b, lever_arm_b)
         H[:, :3, ATTITUDE] = -skew(arm_n)
-        H[:, 3:, ATTITUDE] = -skew(swing_n) + skew(frame.earth_rate_n) @ skew(arm_n)
+        H[:, 3:, ATTITUDE] = -skew(arm_velocity_n) + skew(frame.earth_rate_n) @ skew(arm_n)
         H[:, 3:, GYRO] = state.C_nb @ skew(lever_arm_b)
     return H
 
@@ -271,10 +271,10 @@ def _identity(states: int, dtype: torch.dtype, device: torch.device) -> Tensor:
 
 
 def _rotate_arm(state: NavState, rate_b: Tensor, lever_arm_b: Tensor) -> tuple[Tensor, Tensor]:
-    """The lever arm and its swing ω × l in n."""
+    """The lever arm l and its velocity ω × l in n."""
     both = torch.stack((lever_arm_b, torch.linalg.cross(rate_b, lever_arm_b)), -1)
-    arm, swing = (state.C_nb @ both).unbind(-1)
-    return arm, swing
+    arm, velocity = (state.C_nb @ both).unbind(-1)
+    return arm, velocity
 
 
 def mask_rows(

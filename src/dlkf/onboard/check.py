@@ -124,11 +124,6 @@ def measure_difference(estimator: Estimator, library: Library, tables: CheckedTa
     return Difference(len(rows), largest, float(np.nan_to_num(np.stack(relative)).max()))
 
 
-def measure_latencies(compiled: CompiledFilter, drive: Drive) -> dict[str, Latency]:
-    """:func:`time_epochs` in short."""
-    return {name: Latency.of(seconds) for name, seconds in time_epochs(compiled, drive).items()}
-
-
 def time_epochs(compiled: CompiledFilter, drive: Drive) -> dict[str, list[float]]:
     """Seconds of epochs in Python, as torch runs them and compiled, interleaved; without the first few."""
     batch = align_drives([drive])
@@ -166,6 +161,7 @@ def check_export(
     if found.largest["position [m]"] > FARTHEST_M[grid.dtype]:
         raise InputError(f"the exported filter is not the original: {found.text()}")
     if latency:
-        for name, x in measure_latencies(CompiledFilter(estimator, grid, layout, library), drive).items():
+        for name, seconds in time_epochs(CompiledFilter(estimator, grid, layout, library), drive).items():
+            x = Latency.of(seconds)
             lines.append(f"an epoch in {name}: p50 {x.p50:.3f} ms, p99 {x.p99:.3f} ms")
     return lines

@@ -219,7 +219,7 @@ class ImuStream:
         self._astray = (run[0], t) if run is not None and follows else (t, t)
         self._after = [*(self._after if follows else ()), row][:AFTER_GAP]
         if t == last:
-            return f"t = {t:.6f} again"
+            return f"duplicate time stamp t = {t:.6f}"
         if t < last:
             return f"t goes back from {last:.6f} to {t:.6f}"
         if len(self._after) == AFTER_GAP and self._fill(last):

@@ -118,7 +118,7 @@ class NoiseFit(NamedTuple):
         when = (
             f"{late:.3f} s ± {late_std:.3f} s late"
             if late
-            else f"not late that one could tell (± {late_std:.3f} s; whether they are early is not searched)"
+            else f"not significantly late (± {late_std:.3f} s; negative delays are not searched)"
         )
         where = far if ahead else f"where lever_arm_m says (± {ahead_std:.2f} m along the car)"
         return f"The fixes are {when}; the antenna sits {where}"

@@ -118,7 +118,7 @@ def blank_reference(rows: int) -> dict[str, Any]:
 def _carry_to_imu(drive: Drive, rows: slice, C_eb: Tensor, v_e: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Good fixes brought from the antenna to the IMU and from their time to the boundary: r_e, v_e, good.
 
-    The velocity is the fix's where it has one, else the smoothed; the lever arm's swing ω × l is taken off.
+    The velocity is the fix's where it has one, else the smoothed; the lever-arm velocity ω × l is taken off.
     """
     quality, seen = drive.quality[rows], drive.gnss_valid[rows, :3].all(-1)
     share = {q: float((quality[seen] == q).double().mean()) if bool(seen.any()) else 0.0 for q in WORTH}
@@ -129,7 +129,7 @@ def _carry_to_imu(drive: Drive, rows: slice, C_eb: Tensor, v_e: Tensor) -> tuple
     rate_b = drive.imu[rows.start - 1 : rows.stop - 1, -tail:, 3:].double().mean(1)
     arm = drive.lever_arm_b.expand_as(rate_b)
     known = drive.gnss_valid[rows, 3:].all(-1, keepdim=True)
-    swing = torch.einsum("tij,tj->ti", C_eb, torch.linalg.cross(rate_b, arm))
-    velocity = torch.where(known, drive.gnss_v_e[rows] - swing, v_e)
+    arm_velocity = torch.einsum("tij,tj->ti", C_eb, torch.linalg.cross(rate_b, arm))
+    velocity = torch.where(known, drive.gnss_v_e[rows] - arm_velocity, v_e)
     place = drive.gnss_r_e[rows] - torch.einsum("tij,tj->ti", C_eb, arm) + lag * v_e
     return place, velocity, good

@@ -327,7 +327,7 @@ class StreamingFilter:
             return self._answer(Status.REFUSED, reason)
         screened, changed = self._fixes.add(t, row, fix, oldest=self._samples.epochs - self._rewind)
         if screened is None:
-            return self._answer(Status.REFUSED, f"fix at t = {t:.3f} again")
+            return self._answer(Status.REFUSED, f"duplicate fix at t = {t:.3f}")
         for boundary in changed:
             self._put_fix(boundary)
         estimates = self._replay(min(changed)) if changed else None
@@ -348,7 +348,7 @@ class StreamingFilter:
         if reason := self._timing_fault(name, t, row, FIRST_OF_AIDS):
             return self._answer(Status.REFUSED, reason)
         if not self._buffer.put_aid(row, name, t, value, std):
-            return self._answer(Status.REFUSED, f"{name} at t = {t:.3f} again")
+            return self._answer(Status.REFUSED, f"duplicate {name} at t = {t:.3f}")
         estimates = self._replay(row)
         return TAKEN if estimates is None else self._receipt(estimates)
 

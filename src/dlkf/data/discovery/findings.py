@@ -226,9 +226,11 @@ def _arm(pose: Pose | None) -> Finding:
     """The horizontal lever arm, where it is observable to 0.3 m (1σ); else zero, with a line."""
     if pose is None or pose.lever_arm_std > 0.3:
         seen = "not at all" if pose is None else f"only to {pose.lever_arm_std:.1f} m"
-        return Finding("lever_arm_m", [0.0, 0.0, 0.0], True, f"can be seen {seen}: zero kept, measure it")
+        return Finding("lever_arm_m", [0.0, 0.0, 0.0], True, f"observable {seen}: zero kept, measure it")
     value = [round(pose.lever_arm.real, 2), round(pose.lever_arm.imag, 2), 0.0]
-    return Finding("lever_arm_m", value, True, f"± {pose.lever_arm_std:.2f} m; the height cannot be seen, measure it")
+    return Finding(
+        "lever_arm_m", value, True, f"± {pose.lever_arm_std:.2f} m; the height is not observable, measure it"
+    )
 
 
 def _delay(gnss: Columns) -> Finding:

@@ -372,7 +372,7 @@ int dlkf_align(const dlkf *d, int64_t epoch, double *start, double *u_b, double 
   carried_force(d, epoch, u_b, turned);
   rate_at(d, epoch, first, rate_b);
   rate_at(d, epoch - BACK, first, rate_then);
-  /* velocity of the IMU in n at both ends: the antenna's less the swing of the lever arm */
+  /* velocity of the IMU in n at both ends: the antenna's less the lever-arm velocity */
   cross3(rate_b, arm, swing_b);
   cross3(rate_then, arm, swing_then);
   double slip = swing_b[1] / slow;

@@ -169,7 +169,7 @@ class FirstMotion:
         a, row = self.aligned, self.row
         less = a.C_eb[row] - self.C_eb
         r_e = a.r_e[row] + less @ self.drive.lever_arm_b
-        v_e = a.v_e[row] + less @ _swing(self.drive, row)
+        v_e = a.v_e[row] + less @ _arm_velocity(self.drive, row)
         start = _start_at(row, r_e, v_e, self.C_eb, torch.cat((a.std[row, :6], self.std)))
         return replace(start, gyro=self.gyro, noise=self.noise)
 
@@ -369,7 +369,7 @@ def _make_start(motion: FirstMotion, config: AlignConfig, earliest: int) -> Star
     else:
         v_n = C_en.mT @ drive.gnss_v_e[k]
         known_v, lag = drive.gnss_valid[k, 3:], float(drive.gnss_lag[k])
-        v_e = C_en @ torch.where(known_v, v_n, 0.0) - C_eb @ _swing(drive, k)
+        v_e = C_en @ torch.where(known_v, v_n, 0.0) - C_eb @ _arm_velocity(drive, k)
         v_std = torch.hypot(motion.noise[1] * drive.gnss_std[k, 3:], v_n.new_tensor(STALE_ACCELERATION * lag))
         v_std = torch.where(known_v, v_std, 0.5)
     r_e = drive.gnss_r_e[k] - C_eb @ drive.lever_arm_b + float(drive.gnss_lag[k]) * v_e
@@ -389,7 +389,7 @@ def _ned_axes_at(r_e: Float[Tensor, " 3"]) -> Float[Tensor, "3 3"]:
     return ned_axes(*geodetic_from_ecef(r_e)[:2])
 
 
-def _swing(drive: Drive, row: int) -> Float[Tensor, " 3"]:
+def _arm_velocity(drive: Drive, row: int) -> Float[Tensor, " 3"]:
     """Velocity of the antenna against the IMU at a boundary, in b: ω × l with the mean rate around it."""
     samples = drive.imu[max(0, row - 1) : row + 1, :, 3:].double().flatten(0, 1)
     middle, tail = (0 if row == 0 else drive.imu.shape[1]), max(1, round(RATE_AVERAGE_S * drive.rate_hz))
