@@ -59,11 +59,11 @@ class Recorded(CarConstraints):
 
     def detect_rest(
         self, epoch: Epoch, turning: Float[Tensor, "B 3"], prediction: Predicted, memory: CarMemory
-    ) -> tuple[Bool[Tensor, " B"], VibrationLevel]:
+    ) -> tuple[Bool[Tensor, " B"], VibrationLevel, Float[Tensor, "B 3"]]:
         """As without recording."""
-        resting, level = super().detect_rest(epoch, turning, prediction, memory)
+        resting, level, variance = super().detect_rest(epoch, turning, prediction, memory)
         self.found.append(resting)
-        return resting, level
+        return resting, level, variance
 
 
 def count_standstills(cases: Iterable[Case]) -> tuple[int, int, int, int]:

@@ -90,9 +90,9 @@ class Watched(CarConstraints):
     seen: list[torch.Tensor] = field(default_factory=list)
 
     def detect_rest(self, epoch, turning, prediction, memory):
-        found, level = super().detect_rest(epoch, turning, prediction, memory)
+        found, level, variance = super().detect_rest(epoch, turning, prediction, memory)
         self.seen.append(found)
-        return found & self.used, level
+        return found & self.used, level, variance
 
 
 def classical():

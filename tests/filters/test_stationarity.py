@@ -57,9 +57,9 @@ class Watched(CarConstraints):
     found: ClassVar[list[torch.Tensor]] = []
 
     def detect_rest(self, epoch, turning, prediction, memory):
-        resting, liveliness = super().detect_rest(epoch, turning, prediction, memory)
+        resting, liveliness, variance = super().detect_rest(epoch, turning, prediction, memory)
         self.found.append(resting)
-        return resting, liveliness
+        return resting, liveliness, variance
 
 
 def steady(speeds: tuple[float, ...], epochs: int, stand_s: int = 10, ramp_s: float = 0.0):
@@ -220,7 +220,7 @@ def test_the_level_is_that_of_a_second_whatever_the_update_interval():
         cut = in_parts(batch, per_second) if per_second > 1 else batch
         second, levels = LastSecond.begin(cut), []
         for k in range(cut.size[1]):
-            second, level, mean, whole = second.update(cut.imu[:, k], cut.dt)
+            second, (level, mean, whole, _) = second.update(cut.imu[:, k], cut.dt)
             assert level is not None
             levels.append(level)
         torch.testing.assert_close(torch.stack(levels, 1)[:, per_second - 1 :: per_second], torch.from_numpy(expected))
@@ -230,7 +230,7 @@ def test_the_level_is_that_of_a_second_whatever_the_update_interval():
         whole = replace(batch, imu=torch.zeros(2, 3, rate, 6, dtype=D), dt=1 / rate)
         assert LastSecond.begin(whole).means is None
     slow = replace(batch, imu=batch.imu.mean(2, keepdim=True), dt=1.0)
-    assert LastSecond.begin(slow).update(slow.imu[:, 0], 1.0)[1] is None
+    assert LastSecond.begin(slow).update(slow.imu[:, 0], 1.0)[1].level is None
 
 
 def positions_alone(batch: Batch) -> Batch:
@@ -352,10 +352,10 @@ def test_one_sample_an_epoch_has_no_spread():
 
     class Hearing(CarConstraints):
         def detect_rest(self, epoch, turning, prediction, memory):
-            resting, liveliness = super().detect_rest(epoch, turning, prediction, memory)
+            resting, liveliness, variance = super().detect_rest(epoch, turning, prediction, memory)
             heard.append(liveliness)
             assert not resting.any()
-            return resting, liveliness
+            return resting, liveliness, variance
 
     kalman = build_filter("mbkf15_nhc", IMU)
     sources = tuple(Hearing(s.tuning, s.states) if isinstance(s, CarConstraints) else s for s in kalman.sources)

@@ -190,6 +190,10 @@ def test_the_batch_run_starts_over_as_the_stream_does(drive):
     found = {e.t: e for r in replay_drive(stream, bad.imu, bad.gnss) for e in r.estimates}
     assert stream.counts["lost"] >= 2 and list(stream.lost_at) == pytest.approx(batch.restarts)
     assert batch.table.t.tolist() == pytest.approx(sorted(found))
+    late = StreamingFilter(Ins(free=True), lever_arm_b=ARM, phase_s=loaded.t0)
+    for _ in replay_drive(late, bad.imu, bad.gnss, arrival=bad.gnss["t"] + 1.7):
+        pass
+    assert late.counts["lost"] == len(late.lost_at) == len(batch.restarts)  # epochs that are run again count once
     assert "lost and started over at t = " in batch.summary()
     last = found[max(found)].row
     off = np.radians([last["lat_deg"] - batch.table.lat_deg.iloc[-1], last["lon_deg"] - batch.table.lon_deg.iloc[-1]])

@@ -80,7 +80,7 @@ class CarConstraints:
         """NHC (2 rows), zero velocity (3), zero angular rate (3)."""
         zn, Hn, moving = self._measure_lateral(epoch, prediction.structure)
         zr, Hr = self._measure_standstill(epoch)
-        resting, liveliness = self.detect_rest(epoch, zr[:, 3:], prediction, memory)
+        resting, liveliness, rate_variance = self.detect_rest(epoch, zr[:, 3:], prediction, memory)
         resting = resting.unsqueeze(-1)
         used = torch.cat(((moving.unsqueeze(-1) & ~resting).expand(-1, 2), resting.expand(-1, 6)), -1)
         per_second = max(1.0, 1.0 / epoch.span_s)
@@ -90,11 +90,13 @@ class CarConstraints:
         noise, of_state, a_second = memory.noise, predicted_variance(prediction.P, Hn), variance[:, :2] / per_second
         if noise is not None:
             variance = torch.cat((noise.factor * variance[:, :2], variance[:, 2:]), -1)
-        S = of_state + variance[:, :2]
         if noise is not None:
             learns = used[:, 0] & _is_near_fix(epoch, prediction.P)
             noise = noise.update(zn, of_state, a_second, OUTLIER, learns)
-        variance = torch.cat((variance[:, :2] * (zn.square() / (OUTLIER**2 * S)).clamp_min(1.0), variance[:, 2:]), -1)
+        across = _widen_outliers(variance[:, :2], zn, of_state)
+        of_bias = prediction.P.diagonal(dim1=-2, dim2=-1)[:, GYRO]
+        rate = _widen_outliers(variance[:, 5:] + rate_variance, zr[:, 3:], of_bias)
+        variance = torch.cat((across, variance[:, 2:5], rate), -1)
         z = torch.cat((zn, zr), -1) * used
         return Measurement(z, torch.cat((Hn, Hr), 1), variance, used), memory._replace(
             liveliness=liveliness, noise=noise
@@ -102,8 +104,9 @@ class CarConstraints:
 
     def detect_rest(
         self, epoch: Epoch, turning: Float[Tensor, "B 3"], prediction: Predicted, memory: CarMemory
-    ) -> tuple[Bool[Tensor, " B"], VibrationLevel]:
-        """Whether the car was stationary in the window, and the vibration levels after it."""
+    ) -> tuple[Bool[Tensor, " B"], VibrationLevel, Float[Tensor, "B 3"]]:
+        """Whether the car was stationary in the window, the vibration levels after it, and the variance of its mean
+        rate by the samples."""
         wheel = None
         if prediction.rolling is not None and prediction.stopped is not None:
             wheel = WheelMotion(prediction.rolling, prediction.stopped)
@@ -158,6 +161,13 @@ def _is_near_fix(epoch: Epoch, P: Float[Tensor, "B n n"]) -> Bool[Tensor, " B"]:
 
 @lru_cache
 @torch.inference_mode(False)
+def _widen_outliers(
+    variance: Float[Tensor, "B n"], z: Float[Tensor, "B n"], of_state: Float[Tensor, "B n"]
+) -> Float[Tensor, "B n"]:
+    """Variance of rows, larger where an innovation z is beyond ``OUTLIER`` σ: a skid, or a car that still sways."""
+    return variance * (z.square() / (OUTLIER**2 * (of_state + variance))).clamp_min(1.0)
+
+
 def _standstill_matrix(states: int, dtype: torch.dtype, device: torch.device) -> Float[Tensor, "6 n"]:
     """H of velocity and of the gyroscopes' rate."""
     eye = torch.eye(states, dtype=dtype, device=device)

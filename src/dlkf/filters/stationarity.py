@@ -62,6 +62,15 @@ MOST_FIXES, FIX_S = 10.0, 3.0  # in that mean; s after the last of them that it 
 LONG_SPEED, FAR_APART = 10.0, 30.0  # m/s, at most; a level of rest is taken for so many times below that of motion
 
 
+class IntervalMeans(NamedTuple):
+    """What the samples of an update interval, or of the last second if that is longer, show."""
+
+    level: Tensor | None  # (B,) of vibration; None: too few samples for one
+    mean: Tensor  # (B, 6) over the interval, or the last 0.2 s if it is shorter
+    whole: Tensor  # (B, 6) over the interval, or the second
+    rate_variance: Tensor  # (B, 3) of the mean rate over the interval, were means over ``AVERAGE_S`` white
+
+
 class LastSecond(NamedTuple):
     """The samples of the last second, as means over ``AVERAGE_S`` or the update intervals that are shorter."""
 
@@ -76,11 +85,8 @@ class LastSecond(NamedTuple):
             return cls(None)
         return cls(batch.imu.new_full((B, parts.count, 6), math.nan))
 
-    def update(
-        self, imu: Float[Tensor, "B M 6"], dt: float
-    ) -> tuple[LastSecond, Float[Tensor, " B"] | None, Float[Tensor, "B 6"], Float[Tensor, "B 6"]]:
-        """After the samples of an update interval, the vibration level (None: too few samples for one), the mean
-        over the interval, or the last 0.2 s if it is shorter, and that over the interval, or a second if shorter."""
+    def update(self, imu: Float[Tensor, "B M 6"], dt: float) -> tuple[LastSecond, IntervalMeans]:
+        """After the samples of an update interval."""
         parts = _Parts.of(imu.shape[1], dt)
         means = imu[:, imu.shape[1] - parts.each * parts.samples :]
         if parts.samples > 1:
@@ -88,13 +94,14 @@ class LastSecond(NamedTuple):
         if self.means is not None:
             means = torch.cat((self.means, means), 1)[:, -parts.count :]
         boxes = means.unflatten(1, (-1, parts.together)).mean(2) if parts.together > 1 else means
-        level = vibration_level(boxes) if boxes.shape[1] > 1 else None
-        return (
-            LastSecond(None if self.means is None else means),
-            level,
-            means[:, -max(parts.each, 2 * parts.together) :].mean(1),
-            means.mean(1),
-        )
+        level, variance = None, torch.zeros_like(boxes[:, 0, 3:])
+        if boxes.shape[1] > 1:
+            spread = _variances(boxes)
+            level = _level(spread)
+            variance = parts.together * parts.samples / imu.shape[1] * spread[:, 3:].nan_to_num()
+        mean = means[:, -max(parts.each, 2 * parts.together) :].mean(1)
+        last = LastSecond(None if self.means is None else means)
+        return last, IntervalMeans(level, mean, means.mean(1), variance)
 
 
 class _Parts(NamedTuple):
@@ -263,26 +270,35 @@ class WheelMotion(NamedTuple):
 
 def vibration_level(means: Float[Tensor, "B k 6"]) -> Float[Tensor, " B"]:
     """Spread of specific force times spread of rate [m/s² rad/s]; inf where one is not known yet."""
-    swing = means - means.mean(1, keepdim=True)  # torch's var of a middle axis takes four times as long
-    force, rate = (swing.square().sum(1) / (means.shape[1] - 1)).unflatten(-1, (2, 3)).sum(-1).unbind(-1)
+    return _level(_variances(means))
+
+
+def _level(variances: Float[Tensor, "B 6"]) -> Float[Tensor, " B"]:
+    force, rate = variances.unflatten(-1, (2, 3)).sum(-1).unbind(-1)
     level = (force * rate).sqrt()
     return torch.where(level.isnan(), math.inf, level)
+
+
+def _variances(means: Float[Tensor, "B k 6"]) -> Float[Tensor, "B 6"]:
+    """Over the means of a second; torch's var of a middle axis takes four times as long."""
+    return (means - means.mean(1, keepdim=True)).square().sum(1) / (means.shape[1] - 1)
 
 
 @torch.no_grad()
 def detect_stationary(
     epoch: Epoch, turning: Float[Tensor, "B 3"], P: Float[Tensor, "B n n"], before: VibrationLevel,
     prior: Float[Tensor, " 1"], wheel: WheelMotion | None = None,
-) -> tuple[Bool[Tensor, " B"], VibrationLevel]:  # fmt: skip
-    """Whether the car was stationary in the window, and the levels after it; ``turning`` is its mean rate [rad/s].
+) -> tuple[Bool[Tensor, " B"], VibrationLevel, Float[Tensor, "B 3"]]:  # fmt: skip
+    """Whether the car was stationary in the window, the levels after it, and the variance of its mean rate
+    ``turning`` [rad/s] by the samples.
 
     Of one sample a second there is no spread: the levels stay, and no standstill is found. A ``wheel`` that rolls
     forbids a standstill, one that is stopped makes it where the samples show neither acceleration nor turn, at any
     vibration; and both give levels of this car where GNSS gives no velocity.
     """
-    second, level, mean, whole = before.second.update(epoch.corrected, epoch.dt)
+    second, (level, mean, whole, variance) = before.second.update(epoch.corrected, epoch.dt)
     if level is None:
-        return torch.zeros_like(before.standing) > 0, before
+        return torch.zeros_like(before.standing) > 0, before, variance
     span = epoch.span_s
     v, diagonal = epoch.window.end.v_n, P.diagonal(dim1=-2, dim2=-1)
     speed, std = v[:, :2].norm(dim=-1), diagonal[:, VELOCITY][:, :2].sum(-1).sqrt()
@@ -329,7 +345,7 @@ def detect_stationary(
     stationary = (stationary | proven) & ~creeps
     if wheel is not None:
         stationary = stationary & ~wheel.rolling | stopped
-    return stationary, after._replace(rest=rest.update(force, stationary, span))
+    return stationary, after._replace(rest=rest.update(force, stationary, span)), variance
 
 
 def _speed_doubt(

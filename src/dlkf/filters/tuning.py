@@ -50,7 +50,7 @@ class Tuning:
     lateral_std: float = 0.2
     vertical_std: float = 0.2
     rest_velocity_std: float = 0.05
-    rest_rate_std: float = 2e-3
+    rest_rate_std: float = 3e-4
     rest_accel: float = 0.12
     rest_gyro: float = 0.025
     wheel_std: float = 0.1

@@ -47,11 +47,15 @@ class Running(NamedTuple):
 
 @dataclass
 class Closed:
-    """A closed epoch: samples (1, M, 6), and the filter, or the search for a heading, at its start."""
+    """A closed epoch: samples (1, M, 6), and the filter, or the search for a heading, at its start.
+
+    ``ended``: that the filter was ``lost`` or had ``diverged`` at its end.
+    """
 
     number: int
     imu: Tensor
     before: Running | Search | None = None
+    ended: str | None = None
 
 
 class EpochFilter:
@@ -154,6 +158,7 @@ class EpochFilter:
     def _run(self, k: int) -> list[Estimate]:
         """The filter over closed epoch ``k`` of those held: align at its start if need be, then one turn."""
         epoch = self.closed[k]
+        self._take_back(epoch)
         epoch.before = self.running
         running = self.running or self._find_start(k)
         if isinstance(running, Search):
@@ -172,9 +177,7 @@ class EpochFilter:
         except torch.linalg.LinAlgError:  # pyright: ignore[reportPrivateImportUsage]
             finite = False
         if not finite:
-            self.counts["diverged"] += 1
-            self.running = self.latest = None
-            return []
+            return self._end(epoch, "diverged")
         watch = running.watch
         if bool(fix.used[:, :3].any()):
             share = float(far_off(step.innovation, fix.std))
@@ -182,10 +185,8 @@ class EpochFilter:
             watch = watch.update(epoch.number * self._epoch_s, share, held.r_e[0].tolist(), off)
         nowhere = is_impossible(step.posterior.v_n, step.posterior.p_n, running.frame.height.to(step.posterior.p_n))
         if watch.is_lost(epoch.number * self._epoch_s) or bool(nowhere):
-            self.counts["lost"] += 1
             self.lost_at.append(self._boundary(epoch.number + 1))
-            self.running = self.latest = None
-            return []
+            return self._end(epoch, "lost")
         self.running = self._move_anchor(Running(memory, step.posterior, step.error, running.frame, watch))
         accepted = step.answer.accepted
         used = bool(fix.used.any()) and (accepted is None or bool(accepted.any()))
@@ -193,6 +194,22 @@ class EpochFilter:
         said = None if step.answer.aids is None else dict(zip(self._said, step.answer.aids[0].tolist()))
         self.latest = Estimate(t, running.frame, step.posterior, step.complete_error, step.answer.std, used, said)
         return [self.latest]
+
+    def _end(self, epoch: Closed, ended: str) -> list[Estimate]:
+        """No filter after an epoch."""
+        self.counts[ended] += 1
+        epoch.ended = ended
+        self.running = self.latest = None
+        return []
+
+    def _take_back(self, epoch: Closed) -> None:
+        """An epoch that is run again counts once."""
+        if epoch.ended is None:
+            return
+        self.counts[epoch.ended] -= 1
+        if epoch.ended == "lost" and (at := self._boundary(epoch.number + 1)) in self.lost_at:
+            self.lost_at.remove(at)
+        epoch.ended = None
 
     def _fix(self, held: FixRows, frame: TangentFrame) -> Fix:
         """A held fix as the loop takes it."""
@@ -226,7 +243,7 @@ class EpochFilter:
         fix = EarthFix(*(torch.from_numpy(getattr(held, n)) for n in ("r_e", "v_e", "std", "valid", "lag")))
         search = search.advance(epoch.imu.cpu(), fix)
         if not search.finite:
-            self.counts["diverged"] += 1
+            self._end(epoch, "diverged")
             return None
         start = search.start()
         return search if start is None else self._begin_filter(start, self._drive([epoch]))

@@ -88,7 +88,7 @@ class WheelSpeed(SensorSource):
         said = aid_of(epoch, self.table.name)
         if said is None:
             return None, memory
-        second, level, *_ = memory.second.update(epoch.corrected, epoch.dt)
+        second, (level, *_) = memory.second.update(epoch.corrected, epoch.dt)
         shaking = torch.zeros_like(memory.calmest) if level is None else level
         value, std, lag, span, count = said.unbind(-1)
         seen = count > 0

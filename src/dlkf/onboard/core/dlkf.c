@@ -90,6 +90,14 @@ static void begin_filter(dlkf *d, const double *start) {
   memset(&d->watch, 0, sizeof d->watch);
 }
 
+/* No filter after an update interval. */
+static void end_filter(dlkf *d, int64_t number, dlkf_status status) {
+  d->counts[status]++;
+  before(d, number)->ended = (int32_t)status;
+  d->kind = DLKF_NOTHING;
+  d->latest = 0;
+}
+
 /* Align at the start of a closed update interval, or search over it; whether there is a filter for it. */
 static int aligned(dlkf *d, int64_t number) {
   double start[DLKF_START];
@@ -106,8 +114,7 @@ static int aligned(dlkf *d, int64_t number) {
     d->kind = DLKF_SEARCH;
   }
   if (!dlkf_search_advance(d, epoch_at(d, number)->imu, number + 1)) {
-    d->counts[DLKF_DIVERGED]++;
-    d->kind = DLKF_NOTHING;
+    end_filter(d, number, DLKF_DIVERGED);
   } else if (dlkf_search_start(d, start)) {
     doubt = d->now.search.doubt;
     begin_filter(d, start);
@@ -128,6 +135,8 @@ static void run(dlkf *d, int64_t number, int revised) {
   dlkf_epoch *epoch = epoch_at(d, number);
   dlkf_before *held = before(d, number);
   double fix[DLKF_FIX];
+  if (revised && held->ended) d->counts[held->ended]--; /* an update interval that is run again counts once */
+  held->ended = 0;
   held->watch = d->watch;
   held->doubt = d->doubt;
   held->kind = d->kind;
@@ -145,9 +154,7 @@ static void run(dlkf *d, int64_t number, int revised) {
   for (int k = 0; k < 15; k++) sum += d->outputs[DLKF_OUTPUTS_POSTERIOR + k];
   const int finite = isfinite(sum);
   if (!finite || dlkf_lost(d, number, fix)) {
-    d->counts[finite ? DLKF_LOST : DLKF_DIVERGED]++;
-    d->kind = DLKF_NOTHING;
-    d->latest = 0;
+    end_filter(d, number, finite ? DLKF_LOST : DLKF_DIVERGED);
     return;
   }
   double *row = d->rows[d->made++];

@@ -145,7 +145,7 @@ typedef struct {
   dlkf_state state;
   dlkf_watch watch;
   double doubt;
-  int32_t kind;
+  int32_t kind, ended; /* status with which the filter ended there: LOST, DIVERGED, or 0 */
 } dlkf_before; /* an update interval: what a late fix goes back to */
 
 typedef struct {

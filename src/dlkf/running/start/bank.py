@@ -69,9 +69,9 @@ class Sideslip(CarConstraints):
 
     def detect_rest(
         self, epoch: Epoch, turning: Tensor, prediction: Predicted, memory: Any
-    ) -> tuple[Bool[Tensor, " B"], VibrationLevel]:
+    ) -> tuple[Bool[Tensor, " B"], VibrationLevel, Float[Tensor, "B 3"]]:
         """Never."""
-        return torch.zeros(len(turning), dtype=torch.bool), memory.liveliness
+        return torch.zeros(len(turning), dtype=torch.bool), memory.liveliness, torch.zeros_like(turning)
 
 
 @dataclass(frozen=True)
