@@ -177,7 +177,8 @@ def test_a_standing_car_stays_where_it_is():
 @pytest.mark.parametrize("change", [1e-3, 5e-3])
 def test_a_bias_that_has_changed_is_seen_at_rest(change):
     """The gyroscopes warm up while the car drives, and go on as it stands: 0.06 and 0.3 °/s in all. What a second at
-    rest shows is the bias, so the heading stays within a degree and 20 s after the stop the bias is known to a quarter of the change."""
+    rest shows is the bias, so the heading stays within a degree, and 20 s after the stop the bias is known to a
+    quarter of the change."""
     batch = outage(slipping(6, 160, (0.0,) * 5, stop=40), 40, 160)
     warm = change * -torch.expm1(-torch.arange(160, dtype=D) / 60)
     batch = replace(batch, imu=batch.imu + torch.nn.functional.pad(warm[:, None, None], (5, 0)))

@@ -64,6 +64,8 @@ def _from(t, value, otherwise):
 
 FAULTS = {
     "stuck": lambda v, t: _from(t, v[:, FAULT - 1 : FAULT], v),
+    "stuck at a speed that the car had in the outage": lambda v, t: _from(t, v[:, FAULT - 8 : FAULT - 7], v),
+    "stuck at 10 m/s from the beginning": lambda v, t: 0 * v + 10,
     "zero": lambda v, t: _from(t, 0 * v, v),
     "doubled": lambda v, t: _from(t, 2 * v, v),
     "late by half a second": lambda v, t: _from(t, 0.5 * (v + v.roll(1, 1)), v),

@@ -306,7 +306,7 @@ def detect_stationary(
     if second.means is not None:  # short intervals show the swing of the vibration
         force_n = torch.bmm(epoch.window.end.C_nb, mean[:, :3].unsqueeze(-1)).squeeze(-1)
         gained, turn = force_n[:, :2].norm(dim=-1), mean[:, 3:].norm(dim=-1)
-    doubt = 2 * _acceleration_std(P, epoch.window.end.C_nb)
+    doubt = 2 * acceleration_std(P, epoch.window.end.C_nb)
     unlearned = before.standing.isinf() & before.moving.isinf()
     doubt = torch.where(unlearned, doubt.clamp_max(UNLEARNED_ACCEL), doubt)
     straight = turn < STILL_RATE + 2 * diagonal[:, GYRO].sum(-1).sqrt()
@@ -356,7 +356,7 @@ def _speed_doubt(
     return torch.where(surely, PLAUSIBLE_SIGMAS * std, doubt)
 
 
-def _acceleration_std(P: Float[Tensor, "B n n"], C_nb: Float[Tensor, "B 3 3"]) -> Float[Tensor, " B"]:
+def acceleration_std(P: Float[Tensor, "B n n"], C_nb: Float[Tensor, "B 3 3"]) -> Float[Tensor, " B"]:
     """1σ of the horizontal acceleration [m/s²]: δa = f × δh + C ε with f of a car that hardly accelerates. At a
     standstill tilt and bias cancel each other."""
     g = NOMINAL_GRAVITY

@@ -84,6 +84,7 @@ MEMORY = {  # by the last parts of a field's name
     "factor": "factor on the 1σ of a further sensor",
     "last": "last speed of the wheel [m/s]",
     "repeats": "how often that speed came again",
+    "gained": "what the INS has gained in speed in the last seconds since it came first [m/s]",
     "whole": "share of its speeds that were whole km/h",
     "signed": "1 where it has been negative",
     "calmest": "least level of a second in motion: spread of force times that of rate [m/s² rad/s]",

@@ -8,12 +8,13 @@ and its samples of an update interval make one measurement, compared with the me
 stretch. The error states refer to the interval's end, L seconds after the middle of the stretch:
 δv(t) = δv + L ([f_n×] δh + C ε).
 
-R holds white noise, slip in proportion to speed and acceleration (tyre stiffness; Gillespie 1992), and is larger for a
-value that repeats itself, whose error is the same each time. Whole km/h are intervals
+R holds white noise, slip in proportion to speed and acceleration (tyre stiffness; Gillespie 1992), and is larger, but
+not for the gate, for a value that repeats itself, whose error is the same each time. Whole km/h are intervals
 (:mod:`dlkf.filters.aids.rounding`). The gate allows for a drift of the filter's own speed that its covariance does not
 cover, which is no fault of a wheel. A reading of zero counts only where the car is nearly at rest already or shakes no
-more than in its calmest second of motion: a sensor that is dead or a wheel that is locked does not stop the car. A
-sensor without a sign is read with the sign of the filter's own speed.
+more than in its calmest second of motion: a sensor that is dead or a wheel that is locked does not stop the car. Any
+other value is that of a dead sensor, too, if it stays the same while the speed of the INS changes. A sensor without a
+sign is read with the sign of the filter's own speed.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from collections.abc import Mapping
 from typing import ClassVar, NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from dlkf.data.aid_tables import STANDARD, AidTable
@@ -33,7 +34,7 @@ from dlkf.filters.aids.stretch import mean_force, stack_limits, stretch_weights,
 from dlkf.filters.aids.trust import Trust, judge
 from dlkf.filters.integration import Epoch
 from dlkf.filters.sources import Measurement, Parameter, Predicted, SensorSource, aid_of, predicted_variance
-from dlkf.filters.stationarity import LastSecond
+from dlkf.filters.stationarity import LastSecond, acceleration_std
 
 LEAST_STD = 0.03  # m/s: the least 1σ, whatever a file gives
 KMH = 1 / 3.6
@@ -47,6 +48,8 @@ ZERO, ZERO_STD = 0.05, 0.1  # m/s: a wheel at rest, and how slowly it may turn t
 NEARLY_AT_REST = 0.5  # m/s: so slow a car may be stopped by its wheel alone
 KNOWS = 0.5  # m/s 1σ: a filter whose speed is better than this can detect a wrong wheel
 DRIFT = 0.2  # m/s² of an IMU that its filter's covariance does not cover: beyond the gate, but no fault of the wheel
+# m/s, beyond 2σ of the accelerations: by so much the speed may change within some seconds while a wheel's does not
+DEAD, DEAD_S = 1.0, 10.0
 MEMORY_S = 100.0  # s in which the calmest second of motion grows by e
 
 
@@ -57,6 +60,7 @@ class WheelMemory(NamedTuple):
     trust: Trust
     last: Tensor  # (B,) m/s, the last value
     repeats: Tensor  # (B,) how often it came again
+    gained: Tensor  # (B,) m/s of the INS in the last seconds since it came first
     whole: Tensor  # (B,) share of the values that were whole km/h
     signed: Tensor  # (B,) bool: it has been negative
     calmest: Tensor  # (B,) least vibration level of a second in motion, m/s² rad/s
@@ -81,7 +85,7 @@ class WheelSpeed(SensorSource):
         std = batch.imu.new_tensor([self.tuning.wheel_std])
         trust = Trust.begin(batch.imu, B)
         no, unknown = zeros > 0, torch.full_like(zeros, math.inf)
-        return WheelMemory(std, trust, zeros, zeros, zeros, no, unknown, no, no, LastSecond.begin(batch))
+        return WheelMemory(std, trust, zeros, zeros, zeros, zeros, no, unknown, no, no, LastSecond.begin(batch))
 
     def rows(self, epoch: Epoch, memory: WheelMemory, prediction: Predicted) -> tuple[Measurement | None, WheelMemory]:
         """The row, and what the wheel has earned by it."""
@@ -102,20 +106,23 @@ class WheelSpeed(SensorSource):
         repeats = torch.where(
             seen, torch.where(same, (memory.repeats + 1).clamp_max(ROUNDED_REPEATS), 0.0), memory.repeats
         )
+        gained, dead = self._watch_gain(epoch, memory, prediction, seen & ~same)
         in_kmh = (value / KMH * count).abs()
         fits = ((in_kmh - (in_kmh + 0.5).floor()).abs() < 1e-3).to(value.dtype)
         turns = seen & (value.abs() > ROLLING)
         whole = torch.where(turns, torch.lerp(memory.whole, fits, 0.1), memory.whole)
         zero = value.abs() < ZERO
         noise = torch.where(std > 0, std.clamp_min(LEAST_STD), memory.std)
-        noise = torch.where(zero, noise.clamp_min(ZERO_STD), noise * (1 + repeats.clamp_max(REPEATS)))
+        noise = torch.where(zero, noise.clamp_min(ZERO_STD), noise)
         rounded = (whole > 0.5) & ~zero
         noise = torch.where(rounded, (memory.std.square() + (JITTER_S * accel).square()).sqrt(), noise)
-        R = noise.square() + (SLIP * speed * accel).square()
-        plausible = ~zero | (z.abs() < NEARLY_AT_REST) | (shaking <= memory.calmest)
+        slip = (SLIP * speed * accel).square()
+        gate = noise.square() + slip
+        R = torch.where(zero | rounded, gate, (noise * (1 + repeats.clamp_max(REPEATS))).square() + slip)
+        plausible = torch.where(zero, (z.abs() < NEARLY_AT_REST) | (shaking <= memory.calmest), ~dead)
         beyond = torch.where(rounded, (z.abs() - 0.5 * KMH).clamp_min(0.0), z)
         drifted = (DRIFT * epoch.dt * epoch.imu.shape[1]) ** 2
-        trust, used, excess = judge(memory.trust, seen, beyond, unsure + R + drifted, unsure < KNOWS**2, plausible)
+        trust, used, excess = judge(memory.trust, seen, beyond, unsure + gate + drifted, unsure < KNOWS**2, plausible)
         R = R * excess
         of_cell = rounded_measurement(z, 0.5 * KMH, unsure, R)
         again = torch.where(z.abs() < 0.5 * KMH, (1 + repeats).square(), 1.0)
@@ -123,11 +130,24 @@ class WheelSpeed(SensorSource):
         moving = used & turns & (unsure < KNOWS**2)
         calmest = memory.calmest * math.exp(epoch.span_s / MEMORY_S)
         memory = WheelMemory(
-            memory.std, trust, torch.where(seen, value, memory.last), repeats, whole,
+            memory.std, trust, torch.where(seen, value, memory.last), repeats, gained, whole,
             memory.signed | (used & ~reverse & (value < BACKWARDS)),
             torch.where(moving, torch.minimum(calmest, shaking), calmest), used & turns, used & zero, second,
         )  # fmt: skip
         return Measurement(z.unsqueeze(-1), H, R.unsqueeze(-1), used.unsqueeze(-1)), memory
+
+    def _watch_gain(
+        self, epoch: Epoch, memory: WheelMemory, prediction: Predicted, changed: Bool[Tensor, " B"]
+    ) -> tuple[Float[Tensor, " B"], Bool[Tensor, " B"]]:
+        """What the speed of the INS has gained in the last ``DEAD_S`` since the wheel's value ``changed``, and whether
+        that is more than the errors of its accelerations explain: then it stays until the value changes."""
+        end = epoch.window.end
+        limit = DEAD + 2 * DEAD_S * acceleration_std(prediction.P, end.C_nb)
+        before, after = ((x.C_nb[..., 0] * x.v_n).sum(-1) for x in (epoch.start, end))
+        faded = math.exp(-epoch.span_s / DEAD_S) * memory.gained
+        kept = torch.where(memory.gained.abs() > limit, memory.gained, faded + after - before)
+        gained = torch.where(changed, 0.0, kept)
+        return gained, gained.abs() > limit
 
     def _predict_speed(
         self, epoch: Epoch, prediction: Predicted, lag: Tensor, span: Tensor, scale: Tensor
