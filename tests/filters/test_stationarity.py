@@ -21,7 +21,7 @@ from dlkf.filters.stationarity import (
     LastSecond,
     Rest,
     VibrationLevel,
-    _acceleration_std,
+    acceleration_std,
 )
 from dlkf.filters.tuning import Tuning
 from dlkf.navigation.attitude import rotation_from_rpy, rotation_from_vector
@@ -156,7 +156,7 @@ def test_the_uncertainty_of_an_acceleration_is_that_of_the_strapdown():
     P = (A @ A.mT)[None]
     of = [*range(*ATTITUDE.indices(15)), *range(*ACCEL.indices(15))]
     expected = (J @ P[0][of][:, of] @ J.mT).trace().sqrt()
-    torch.testing.assert_close(_acceleration_std(P, C)[0], expected, rtol=2e-3, atol=0)
+    torch.testing.assert_close(acceleration_std(P, C)[0], expected, rtol=2e-3, atol=0)
 
 
 def found(batch, name: str = "mbkf15_nhc", **tuning: float):
@@ -220,11 +220,12 @@ def test_the_level_is_that_of_a_second_whatever_the_update_interval():
         cut = in_parts(batch, per_second) if per_second > 1 else batch
         second, levels = LastSecond.begin(cut), []
         for k in range(cut.size[1]):
-            second, (level, mean, whole, _) = second.update(cut.imu[:, k], cut.dt)
+            second, (level, mean, whole, of_rate) = second.update(cut.imu[:, k], cut.dt)
             assert level is not None
             levels.append(level)
         torch.testing.assert_close(torch.stack(levels, 1)[:, per_second - 1 :: per_second], torch.from_numpy(expected))
         torch.testing.assert_close(mean, batch.imu[:, -1, -max(M // per_second, M // 5) :].mean(1))
+        torch.testing.assert_close(of_rate, 0.1 * per_second * torch.from_numpy(variance[:, -1, 3:]))
         assert all(x.isinf().all() for x in levels[: per_second - 1])
     for rate in (10, 26, 64, 125, 128, 208, 416):  # a second has all that it needs
         whole = replace(batch, imu=torch.zeros(2, 3, rate, 6, dtype=D), dt=1 / rate)
