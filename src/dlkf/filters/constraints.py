@@ -90,7 +90,6 @@ class CarConstraints:
         noise, of_state, a_second = memory.noise, predicted_variance(prediction.P, Hn), variance[:, :2] / per_second
         if noise is not None:
             variance = torch.cat((noise.factor * variance[:, :2], variance[:, 2:]), -1)
-        if noise is not None:
             learns = used[:, 0] & _is_near_fix(epoch, prediction.P)
             noise = noise.update(zn, of_state, a_second, OUTLIER, learns)
         across = _widen_outliers(variance[:, :2], zn, of_state)
@@ -159,8 +158,6 @@ def _is_near_fix(epoch: Epoch, P: Float[Tensor, "B n n"]) -> Bool[Tensor, " B"]:
     return (epoch.used[:, POSITION] & near)[:, :2].all(-1)
 
 
-@lru_cache
-@torch.inference_mode(False)
 def _widen_outliers(
     variance: Float[Tensor, "B n"], z: Float[Tensor, "B n"], of_state: Float[Tensor, "B n"]
 ) -> Float[Tensor, "B n"]:
@@ -168,6 +165,8 @@ def _widen_outliers(
     return variance * (z.square() / (OUTLIER**2 * (of_state + variance))).clamp_min(1.0)
 
 
+@lru_cache
+@torch.inference_mode(False)
 def _standstill_matrix(states: int, dtype: torch.dtype, device: torch.device) -> Float[Tensor, "6 n"]:
     """H of velocity and of the gyroscopes' rate."""
     eye = torch.eye(states, dtype=dtype, device=device)
