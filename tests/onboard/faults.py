@@ -289,6 +289,11 @@ FAULTS: dict[str, tuple[Fault, tuple[str, ...]]] = {
     "positions that scatter by two metres": (SCATTERED, ()),
     "one velocity in three fixes": (
         _changed("gnss", lambda t: round(t) % 3 > 0, lambda x: _put(x, 4, WITHOUT_VELOCITY)), ()),
+    "every third fix lost": (_changed("gnss", lambda t: round(t) % 3 == 1, lambda x: []), ()),
+    "a fix in two seconds": (_changed("gnss", lambda t: round(t) % 2 == 1, lambda x: []), ()),
+    "a fix in four seconds": (_changed("gnss", lambda t: round(t) % 4 > 0, lambda x: []), ()),
+    "a position in two seconds": (
+        lambda sent: ALONE(_changed("gnss", lambda t: round(t) % 2 == 1, lambda x: [])(sent)), ()),
     "no velocities for ten seconds, twice": (
         _changed("gnss", lambda t: round(t) % 20 > 9, lambda x: _put(x, 4, WITHOUT_VELOCITY)), ()),
     "velocities of unknown 1σ": (
@@ -339,5 +344,5 @@ USUAL = (  # one of each kind, of every day's tests; all of them: pytest -m expo
     "spikes in the last and the last but one sample of an update interval", "a tenth of the samples missing",
     "clocks set back 50 s", "coarse positions alone, 3 s late", *JUMPS, *JUMPS_LATE, "a first fix 18 s ahead",
     "wheel speeds at 100 Hz, some again after three seconds", "fix stamps that jitter", "sensors 15 s late",
-    "a locked wheel on a moving car", "damage of all kinds",
+    "every third fix lost", "a position in two seconds", "a locked wheel on a moving car", "damage of all kinds",
 )  # fmt: skip

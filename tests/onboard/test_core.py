@@ -86,6 +86,19 @@ def test_samples_of_sensors_that_cannot_be_taken(exported):
     assert [core.describe_status(x) for x in Status] and core.waiting is Waiting.SAMPLES and core.doubt == 1.0
 
 
+def test_it_says_what_it_waits_for_as_the_python_stream_does(exported, plain):
+    stream, core, said = StreamingFilter(exported[1], lever_arm_b=ARM), Core(exported[3].path, ARM), []
+    for call in FAULTS["coarse positions alone"][0](plain):
+        said.append((stream.waits_for, core.waits_for))
+        getattr(stream, call.kind)(*call.arguments), getattr(core, call.kind)(*call.arguments)
+        if stream.latest is not None:
+            break
+    assert all(a == b for a, b in said)
+    words = list(dict.fromkeys(a for a, _ in said))
+    assert [x.split()[0] for x in words] == ["samples", "fixes", "the", "motion"]
+    assert stream.waits_for == core.waits_for == "nothing"
+
+
 def test_a_rejected_innovation_has_its_own_1σ(exported, plain):
     """Of fixes 100 m off, one in six, it is as large as that of those beside them."""
     core, rows = Core(exported[3].path, ARM), []

@@ -21,7 +21,7 @@ from dlkf.base.config import config_dir
 from dlkf.base.errors import InputError
 from dlkf.base.settings import settings_from
 from dlkf.data.drive import Drive
-from dlkf.data.velocity_fit import MOTION_SIGMAS, antenna_velocity, scale_std
+from dlkf.data.velocity_fit import MOTION_SIGMAS, REACH_S, antenna_velocity, latest_before, scale_std
 from dlkf.navigation.attitude import prefix_rotations, rotation_from_rpy, rotation_from_vector, rpy_from_rotation
 from dlkf.navigation.earth import EARTH_RATE, STANDARD_GRAVITY, ned_axes, normal_gravity
 from dlkf.navigation.error_model import RATE_AVERAGE_S
@@ -104,7 +104,7 @@ class Start:
 
 def align_boundaries(drive: Drive, config: AlignConfig = ALIGN) -> Aligned:
     """Align at every boundary that has a fix with velocity faster than ``min_speed`` and than ``MOTION_SIGMAS`` times
-    its 1σ, and one a window before.
+    its 1σ, and one a window before: of ``window_s``, or up to ``REACH_S`` where fixes are missing.
 
     A source without any velocity has it fitted to its positions. Reads no reference.
     """
@@ -115,13 +115,16 @@ def align_boundaries(drive: Drive, config: AlignConfig = ALIGN) -> Aligned:
     position = drive.gnss_valid[:, :3].all(-1)
     u_b, rate_b, turned = _average_force(drive, back)
     down_b = -u_b / u_b.norm(dim=-1, keepdim=True).clamp_min(1.0)
-    v_n, v_std, known, moving, scatter, off, lag = antenna_velocity(drive, C_en, down_b)
+    v_n, v_std, given, known, moving, scatter, off, lag = antenna_velocity(drive, C_en, down_b)
 
-    then = torch.arange(rows) - back
-    ok = position & moving & (then >= 0)
-    then = then.clamp_min(0)
-    ok &= known[then]
-    span = back * drive.epoch_s - lag + lag[then]
+    then = latest_before(given, back, round(REACH_S / drive.epoch_s))
+    ok = position & moving & (then >= 0) & known[then]
+    windows = torch.where(ok, torch.arange(rows) - then, back)
+    for longer in set(windows.tolist()) - {back}:
+        these = (windows == longer)[:, None]
+        u, _, turn = _average_force(drive, longer)
+        u_b, turned = torch.where(these, u, u_b), torch.where(these[..., None], turn, turned)
+    span = windows * drive.epoch_s - lag + lag[then]
     ok &= span > 0.5 * drive.epoch_s
     span = span.clamp_min(0.5 * drive.epoch_s)
 

@@ -16,8 +16,9 @@ the residuals over their own 1σ, eᵢ / (σᵢ √(1 − hᵢ)) with h the diag
 ``OUTLIER_SIGMAS``, also in units of what the other residuals scatter by. The 1σ of what is found grows with that
 scatter (Birge ratio).
 
-The car moves where it does so by the velocity of a second before too. A receiver's velocity is an outlier where it
-differs from that of a second before, turned with the gyroscopes, by more than a car changes it. Their second
+The car moves where it does so by the velocity before too: that of a second before, of a slow receiver or where fixes
+are missing the last of :data:`REACH_S`. A receiver's velocity is an outlier where it differs from the one before,
+turned with the gyroscopes, by more than a car changes it. Their second
 differences show how much they scatter: E|vₖ − 2 vₖ₋₁ + vₖ₋₂|² = 12 σ² for white noise of σ per axis, of which the
 median is ln 2 times as large. How much the positions beside them do, differences from the way by the velocities show:
 E|pₖ − pₖ₋₁ − ½ (vₖ + vₖ₋₁) Δt|² = 4 σ² + (σᵥ Δt)².
@@ -30,7 +31,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import pad
 
@@ -47,6 +48,7 @@ LEAST_SHARE = 1e-3  # of 1 − h
 OVERDETERMINED = 5  # components more than unknowns, without which no outlier is looked for
 MOTION_SIGMAS = 2.0  # of a velocity: less is no motion
 CONFIRMED_S = 1.0  # that a motion has been one
+REACH_S = FIT_S  # that a velocity may be older than the one it is compared with
 CHANGE_SIGMAS, MOST_ACCELERATION = 3.0, 3.0  # σ and m/s² · time that two velocities of a receiver may differ by
 READ_S = FIT_S + 2 * CONFIRMED_S  # before a boundary
 JOLT_STD = 0.3  # m/s, that second differences of a car's velocity are taken for
@@ -62,8 +64,9 @@ class AntennaVelocity(NamedTuple):
 
     v_n: Float[Tensor, "rows 3"]  # m/s
     std: Float[Tensor, "rows 3"]
-    known: Bool[Tensor, " rows"]  # its horizontal part, and no outlier as far as that shows
-    moving: Bool[Tensor, " rows"]  # not just noise, now and a second before
+    given: Bool[Tensor, " rows"]  # a fix that says something of its horizontal part
+    known: Bool[Tensor, " rows"]  # that part, and no outlier as far as that shows
+    moving: Bool[Tensor, " rows"]  # not just noise, now and by the velocity before
     scatter: Float[Tensor, "rows 2"]  # Birge ratio ≥ 1 of positions, and the like of velocities
     off: Float[Tensor, " rows"]  # m, of the position at the boundary from the fit to the others
     lag: Float[Tensor, " rows"]  # s before the boundary: of the receiver's, that of its fix
@@ -96,19 +99,20 @@ def _read_velocity(drive: Drive, C_en: Float[Tensor, "rows 3 3"], down_b: Float[
     known = drive.gnss_valid[:, 3:]
     v_n = torch.where(known, (C_en.mT @ drive.gnss_v_e.unsqueeze(-1)).squeeze(-1), 0.0)
     std = torch.where(known, drive.gnss_std[:, 3:], _vertical_std(v_n).unsqueeze(-1))
-    before = _count_confirming(drive)
     level, noise = torch.complex(v_n[:, 0], v_n[:, 1]), std[:, :2].amax(-1)
     yaw = _yaw(drive, down_b)
     turn = torch.polar(torch.ones_like(yaw), yaw)
-    change = (level[before:] / turn[before:] - level[:-before] / turn[:-before]).abs()
-    most = CHANGE_SIGMAS * torch.hypot(noise[before:], noise[:-before]) + MOST_ACCELERATION * drive.epoch_s * before
     given = known[:, :2].all(-1) & drive.gnss_valid[:, :3].all(-1)
-    agrees = given & pad((change <= most) | ~given[:-before], (before, 0), value=True)
+    before = _last_confirming(drive, given)
+    change = (level / turn - (level / turn)[before]).abs()
+    apart = drive.epoch_s * (torch.arange(len(given)) - before)
+    most = CHANGE_SIGMAS * torch.hypot(noise, noise[before]) + MOST_ACCELERATION * apart
+    agrees = given & ((change <= most) | (before < 0))
     scatter = _scatter_of_velocities(drive, level / turn, given, noise)
     std[:, :2] = scale_std(std[:, :2], scatter[:, None], JOLT_STD)
     moving = _confirm_motion(agrees & (level.abs() > MOTION_SIGMAS * std[:, :2].amax(-1)), before)
     both = torch.stack((_scatter_of_positions(drive, C_en, v_n, given, noise, scatter), scatter), -1)
-    return AntennaVelocity(v_n, std, agrees, moving, both, torch.zeros_like(scatter), drive.gnss_lag)
+    return AntennaVelocity(v_n, std, given, agrees, moving, both, torch.zeros_like(scatter), drive.gnss_lag)
 
 
 def _scatter_of_velocities(
@@ -164,8 +168,19 @@ def _count_confirming(drive: Drive) -> int:
     return max(1, min(round(CONFIRMED_S / drive.epoch_s), drive.epochs))
 
 
-def _confirm_motion(moves: Bool[Tensor, " rows"], before: int) -> Bool[Tensor, " rows"]:
-    return moves & pad(moves[:-before], (before, 0))
+def latest_before(given: Bool[Tensor, " rows"], least: int, most: int) -> Int[Tensor, " rows"]:
+    """The latest given boundary from ``least`` to ``most`` before each, −1 where there is none."""
+    rows = torch.arange(len(given))
+    last = pad(torch.where(given, rows, -1).cummax(0).values, (least, 0), value=-1)[: len(given)]
+    return torch.where(last >= rows - max(least, most), last, -1)
+
+
+def _last_confirming(drive: Drive, given: Bool[Tensor, " rows"]) -> Int[Tensor, " rows"]:
+    return latest_before(given, _count_confirming(drive), round(REACH_S / drive.epoch_s))
+
+
+def _confirm_motion(moves: Bool[Tensor, " rows"], before: Int[Tensor, " rows"]) -> Bool[Tensor, " rows"]:
+    return moves & moves[before] & (before >= 0)
 
 
 def _yaw(drive: Drive, down_b: Float[Tensor, "rows 3"]) -> Float[Tensor, " rows"]:
@@ -224,12 +239,13 @@ def _fit_velocity(drive: Drive, C_en: Float[Tensor, "rows 3 3"], down_b: Float[T
     v_n[:, 2] = down.found[:, 1]
 
     moves = fixed[:, 0] & (fixed.sum(-1) >= LEAST_FITTED) & (velocity.abs() > MOTION_SIGMAS * spread)
-    moving = _confirm_motion(moves, _count_confirming(drive))
+    moving = _confirm_motion(moves, _last_confirming(drive, usable))
     one = torch.ones_like(scatter)
     off = (x[:, :1] @ fit.found.unsqueeze(-1))[:, 0, 0].abs() / (1 - fit.own[:, 0]).clamp_min(LEAST_SHARE)
     return AntennaVelocity(
         v_n,
         torch.stack((spread, spread, down.covariance[:, 1, 1].sqrt()), -1),
+        usable,
         moving,
         moving,
         torch.stack((scatter, one), -1),

@@ -177,6 +177,7 @@ def _sizes(
         "RATE_MILLIHZ": round(1e3 / grid.dt), "LOOKBACK": lookback,
         "LEVELLED": max(1, round(window_s / grid.epoch_s)), "FITTED": max(2, round(velocity_fit.FIT_S / grid.epoch_s)),
         "CONFIRMED": max(1, round(velocity_fit.CONFIRMED_S / grid.epoch_s)),
+        "REACH": round(velocity_fit.REACH_S / grid.epoch_s),
         "REST": round(LOOKBACK_S / grid.epoch_s), "STILL": max(1, round(standstill.SHORTEST_REST_S / grid.epoch_s)),
         "TAIL": max(1, min(grid.samples, round(alignment.RATE_AVERAGE_S / grid.dt))),
         "FIX": count_fix_numbers(estimator), "START": START, "OUTPUTS": count_output_numbers(estimator),

@@ -47,7 +47,7 @@ class Core:
         self._latest = np.nan
         vector = POINTER(c_double)
         library.dlkf_next.restype = vector
-        library.dlkf_says.restype = c_char_p
+        library.dlkf_says.restype = library.dlkf_waits_for.restype = c_char_p
         library.dlkf_count.restype = ctypes.c_int64
         library.dlkf_imu.argtypes = [ctypes.c_void_p, c_double, vector, vector]
         library.dlkf_gnss.argtypes = [ctypes.c_void_p, c_double, c_double, c_double, c_double, vector, vector, c_int]
@@ -105,6 +105,11 @@ class Core:
     def waiting(self) -> Waiting:
         """What it waits for."""
         return Waiting(self._library.dlkf_waits(self.memory))
+
+    @property
+    def waits_for(self) -> str:
+        """The same in words."""
+        return self._library.dlkf_waits_for(int(self.waiting)).decode()
 
     @property
     def doubt(self) -> float:

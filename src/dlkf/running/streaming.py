@@ -49,6 +49,7 @@ from dlkf.data.alignment import SEARCH, AlignConfig
 from dlkf.data.limits import FROZEN_SPEED_M_S
 from dlkf.data.resampling import ON_BOUNDARY_S, find_boundary, make_fixes
 from dlkf.data.validate import LIMITS, Limits
+from dlkf.data.velocity_fit import FIT_S, REACH_S
 from dlkf.filters.aids.attach import find_tables
 from dlkf.filters.card import warn_slow_drives
 from dlkf.filters.smoother import Filter, SmoothedSolution
@@ -64,6 +65,8 @@ from dlkf.running.start import Search
 ANCHOR_M = 50_000.0  # from its origin, beyond which the tangent frame moves
 SETTLE_S = 3.0  # fixes over so long lay the grid
 MOST_EARLY_SAMPLES = 10_000  # of further sensors
+FIXES_OVER = f"fixes over {SETTLE_S:.0f} seconds"
+MOTION = f"the car to move under GNSS, with velocities at most {REACH_S:g} s apart or positions {FIT_S / 2:g} s"
 FIRST_OF_FIXES, FIRST_OF_AIDS = 0, 1  # boundaries at which they can count
 
 
@@ -158,6 +161,17 @@ class StreamingFilter:
         """Whether the filter still waits for the car to move under GNSS and for a heading; then there are no
         estimates."""
         return not isinstance(self._epochs.running, Running)
+
+    @property
+    def waits_for(self) -> str:
+        """What is missing for estimates, "nothing" where there are some."""
+        if self.latest is not None:
+            return "nothing"
+        if not math.isfinite(self._samples.latest):
+            return "samples of the IMU"
+        if self._epochs.running is not None:
+            return "motion that determines the heading"
+        return FIXES_OVER if self._samples.grid is None else MOTION
 
     @property
     def doubt(self) -> float:

@@ -346,9 +346,27 @@ def test_what_cannot_be_aligned_is_told(drive):
         align(drive, AlignConfig(min_speed=50))
     with pytest.raises(InputError, match="drive car-0: no GNSS fix"):
         align(replace(drive, gnss_valid=torch.zeros_like(drive.gnss_valid)))
-    seldom = (torch.arange(len(drive.gnss_valid)) * drive.epoch_s % 5 < 0.5 * drive.epoch_s).unsqueeze(-1)
-    with pytest.raises(InputError, match="car-0: fixes are 5 s apart, a start needs one an epoch; set epoch_s=5"):
-        align(replace(drive, gnss_valid=drive.gnss_valid & seldom))
+    seldom = drive.gnss_valid & (torch.arange(len(drive.gnss_valid)) % 6 == 0).unsqueeze(-1)
+    with pytest.raises(InputError, match="fixes are 6 s apart, a start needs velocities at most 5 s apart"):
+        align(replace(drive, gnss_valid=seldom))
+
+
+@pytest.mark.parametrize("kept, velocities", [(x, v) for x in ("110", "10", "1000") for v in (True, False)][:-1])
+def test_a_slow_receiver_or_one_that_loses_fixes_starts_a_filter(drive, kept, velocities):
+    """By the last velocity there is, as good as with all fixes."""
+    known = drive.gnss_valid.clone()
+    known[:, 3:] &= velocities
+    whole = align_boundaries(replace(drive, gnss_valid=known))
+    lost = torch.tensor([x == "0" for x in kept]).repeat(len(known))[: len(known)]
+    known[lost] = False
+    some = replace(drive, gnss_valid=known)
+    aligned = align_boundaries(some)
+    assert not aligned.ok[lost].any()
+    assert aligned.ok.sum() > 0.8 * (whole.ok & ~lost).sum() - 3
+    attitude, _, dv, std = _errors(some, aligned)
+    assert attitude.abs().max() < (1.0 if velocities else 3.0) and dv.norm(dim=-1).max() < (0.05 if velocities else 1.0)
+    assert (attitude[:, 2].abs() < 3 * torch.rad2deg(std[:, 8])).all()
+    assert align(some, SEARCH).first < 25
 
 
 def test_fixes_that_are_seconds_apart_start_a_filter_whose_update_interval_is_as_long(town):

@@ -35,11 +35,12 @@ static void rate_at(const dlkf *d, int64_t number, int64_t first, double *rate_b
   mean3(imu + 3, DLKF_TAIL, rate_b);
 }
 
-/* Mean specific force of the window before a boundary in the axes there, and C_b(boundary)b(window's start). */
-static void carried_force(const dlkf *d, int64_t number, double *force_b, double *turned) {
+/* Mean specific force of ``back`` update intervals before a boundary in the axes there, and
+ * C_b(boundary)b(window's start). */
+static void carried_force(const dlkf *d, int64_t number, int back, double *force_b, double *turned) {
   double C[9] = {1, 0, 0, 0, 1, 0, 0, 0, 1}, turn[9], next[9], u[3];
   memset(force_b, 0, 3 * sizeof *force_b);
-  for (int64_t epoch = number - 1; epoch >= number - BACK; epoch--)
+  for (int64_t epoch = number - 1; epoch >= number - back; epoch--)
     for (int k = DLKF_SAMPLES - 1; k >= 0; k--) {
       const double *x = samples(d, epoch) + 6 * k;
       double phi[3];
@@ -50,14 +51,14 @@ static void carried_force(const dlkf *d, int64_t number, double *force_b, double
       for (int c = 0; c < 3; c++) force_b[c] += u[c];
       product3(next, turn, C);
     }
-  for (int c = 0; c < 3; c++) force_b[c] /= BACK * DLKF_SAMPLES;
+  for (int c = 0; c < 3; c++) force_b[c] /= back * DLKF_SAMPLES;
   if (turned) memcpy(turned, C, sizeof C);
 }
 
 /* Yaw that the gyroscopes turn in an update interval: rates about the direction of the force at its end. */
 static double yaw_turned(const dlkf *d, int64_t epoch, int64_t first) {
   double rate_b[3], force_b[3];
-  carried_force(d, epoch + 1 - BACK < first ? first + BACK : epoch + 1, force_b, NULL);
+  carried_force(d, epoch + 1 - BACK < first ? first + BACK : epoch + 1, BACK, force_b, NULL);
   const double size = sqrt(dot3(force_b, force_b));
   mean3(samples(d, epoch) + 3, DLKF_SAMPLES, rate_b);
   return -dot3(rate_b, force_b) / (size > 1 ? size : 1) * EPOCH_S;
@@ -232,15 +233,36 @@ static int read_velocity(const dlkf *d, int64_t number, boundary *b) {
   return 1;
 }
 
-/* Whether a velocity is one that a car can have a second after that before, if there is one. */
+typedef int given(const dlkf *, int64_t, int64_t); /* at a boundary, of fixes from the first on */
+
+static int has_velocity(const dlkf *d, int64_t number, int64_t first) {
+  const dlkf_fix *fix = dlkf_fix_at(d, number);
+  (void)first;
+  return has_position(fix) && fix->used[3] && fix->used[4];
+}
+
+static int has_place(const dlkf *d, int64_t number, int64_t first) {
+  (void)first;
+  return has_position(dlkf_fix_at(d, number));
+}
+
+/* How many update intervals before a boundary, at least ``least``, the last is that is given; 0 where REACH_S has none. */
+static int last_before(const dlkf *d, int64_t number, int64_t first, int least, given *is_given) {
+  for (int j = least; (j <= least || j <= DLKF_REACH) && number - j >= first; j++)
+    if (is_given(d, number - j, first)) return j;
+  return 0;
+}
+
+/* Whether a velocity is one that a car can have after the one before, if there is one. */
 static int agrees(const dlkf *d, int64_t number, int64_t first, const boundary *b) {
   boundary before;
   double yaw = 0;
-  if (number - DLKF_CONFIRMED < first || !read_velocity(d, number - DLKF_CONFIRMED, &before)) return 1;
-  for (int j = 1; j <= DLKF_CONFIRMED; j++) yaw += yaw_turned(d, number - j, first);
+  const int back = last_before(d, number, first, DLKF_CONFIRMED, has_velocity);
+  if (!back || !read_velocity(d, number - back, &before)) return 1;
+  for (int j = 1; j <= back; j++) yaw += yaw_turned(d, number - j, first);
   const double north = b->v_n[0] - (cos(yaw) * before.v_n[0] - sin(yaw) * before.v_n[1]);
   const double east = b->v_n[1] - (sin(yaw) * before.v_n[0] + cos(yaw) * before.v_n[1]);
-  const double may = CHANGE_SIGMAS * hypot(noise_of(b), noise_of(&before)) + MOST_ACCELERATION * EPOCH_S * DLKF_CONFIRMED;
+  const double may = CHANGE_SIGMAS * hypot(noise_of(b), noise_of(&before)) + MOST_ACCELERATION * EPOCH_S * back;
   return hypot(north, east) <= may;
 }
 
@@ -333,20 +355,26 @@ static int read_received(const dlkf *d, int64_t number, int64_t first, boundary 
   return 1;
 }
 
-/* Velocity of the antenna at a boundary with its 1-sigma; where few fixes have any, from positions, if by those of a
- * second before the car moved too. 0 where it is none, or an outlier. */
+/* Velocity of the antenna at a boundary with its 1-sigma; where few fixes have any, from positions, if by those before
+ * it the car moved too. 0 where it is none, or an outlier. */
 static int read_boundary(const dlkf *d, int64_t number, int64_t first, boundary *b) {
   boundary before;
   if (!few_velocities(d, number, first)) return read_received(d, number, first, b);
-  return find_boundary(d, number, b) && fit_velocity(d, number, first, b) && number - DLKF_CONFIRMED >= first &&
-         find_boundary(d, number - DLKF_CONFIRMED, &before) && fit_velocity(d, number - DLKF_CONFIRMED, first, &before);
+  const int back = last_before(d, number, first, DLKF_CONFIRMED, has_place);
+  return find_boundary(d, number, b) && fit_velocity(d, number, first, b) && back &&
+         find_boundary(d, number - back, &before) && fit_velocity(d, number - back, first, &before);
 }
 
-/* Whether the car moves, and did a second before. */
+/* Whether the car moves, and did by the velocity before. */
 static int is_moving(const dlkf *d, int64_t number, int64_t first, const boundary *now) {
   boundary before;
-  return few_velocities(d, number, first) || (moves(now) && number - DLKF_CONFIRMED >= first &&
-                                              read_received(d, number - DLKF_CONFIRMED, first, &before) && moves(&before));
+  if (few_velocities(d, number, first)) return 1;
+  const int back = last_before(d, number, first, DLKF_CONFIRMED, has_velocity);
+  return moves(now) && back && read_received(d, number - back, first, &before) && moves(&before);
+}
+
+static int is_levelled_from(const dlkf *d, int64_t number, int64_t first) {
+  return few_velocities(d, number, first) ? has_place(d, number, first) : has_velocity(d, number, first);
 }
 
 /* A start at the beginning of a closed update interval: latitude, longitude [rad], height [m] of the IMU, velocity (3)
@@ -362,16 +390,18 @@ int dlkf_align(const dlkf *d, int64_t epoch, double *start, double *u_b, double 
   if (!few_velocities(d, epoch, first) && !(read_velocity(d, epoch, &now) && hypot(now.v_n[0], now.v_n[1]) > MIN_SPEED))
     return 0; /* quick */
   if (!read_boundary(d, epoch, first, &now) || !is_moving(d, epoch, first, &now)) return 0;
-  if (!read_boundary(d, epoch - BACK, first, &then)) return 0;
-  const double lag = now.lag, lag_then = then.lag, span = BACK * EPOCH_S - lag + lag_then;
+  const int back = last_before(d, epoch, first, BACK, is_levelled_from);
+  if (!back || !read_boundary(d, epoch - back, first, &then)) return 0;
+  const double lag = now.lag, lag_then = then.lag, span = back * EPOCH_S - lag + lag_then;
   const double speed = hypot(now.v_n[0], now.v_n[1]), slow = speed > 0.1 ? speed : 0.1;
   const double noise = noise_of(&now);
   if (!(span > 0.5 * EPOCH_S) || !(speed > MIN_SPEED) || !(speed > MOTION_SIGMAS * noise)) return 0;
 
-  double turned[9], rate_b[3], rate_then[3], swing_b[3], swing_then[3], u[3], w[3];
-  carried_force(d, epoch, u_b, turned);
+  double turned[9], force_b[3], rate_b[3], rate_then[3], swing_b[3], swing_then[3], u[3], w[3];
+  carried_force(d, epoch, BACK, u_b, NULL);
+  carried_force(d, epoch, back, force_b, turned);
   rate_at(d, epoch, first, rate_b);
-  rate_at(d, epoch - BACK, first, rate_then);
+  rate_at(d, epoch - back, first, rate_then);
   /* velocity of the IMU in n at both ends: the antenna's less the lever-arm velocity */
   cross3(rate_b, arm, swing_b);
   cross3(rate_then, arm, swing_then);
@@ -393,7 +423,7 @@ int dlkf_align(const dlkf *d, int64_t epoch, double *start, double *u_b, double 
   u_n[2] -= normal_gravity(sin(now.lat), now.height);
   apply3_transposed(C_level, u_n, u_h);
   double roll, pitch;
-  level3(u_b, u_h, &roll, &pitch);
+  level3(force_b, u_h, &roll, &pitch);
   rotation_from_rpy(roll, pitch, yaw, C_nb);
 
   double r_e[3], v_e[3], C_eb[9], C_new[9];

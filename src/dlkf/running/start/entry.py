@@ -36,7 +36,7 @@ from dlkf.data.alignment import (
 )
 from dlkf.data.drive import Batch, Drive
 from dlkf.data.segments import whole_drives
-from dlkf.data.velocity_fit import JOLT_STD, scale_std
+from dlkf.data.velocity_fit import FIT_S, JOLT_STD, REACH_S, scale_std
 from dlkf.navigation.attitude import vector_from_rotation
 from dlkf.navigation.earth import EARTH_RATE, STANDARD_GRAVITY, ned_axes
 from dlkf.navigation.error_model import RATE_AVERAGE_S
@@ -69,7 +69,7 @@ WORST_HEADING_STD = math.radians(10)  # a start further back would be worth less
 REST_VELOCITY_STD = 0.05  # m/s
 STALE_ACCELERATION = 2.0  # m/s², by which the velocity of a late fix may be off
 LOOKBACK_S = 12.0  # of samples and fixes that a start without look-ahead reads
-SLOWEST_FIXES_S, SLOWEST_START_S, SLACK_S = 1.5, 10.0, 0.05  # between fixes, with intervals of a second, any; jitter
+SLOWEST_FIXES_S, SLOWEST_START_S, SLACK_S = 2.5, 10.0, 0.05  # between fixes, with intervals of a second, any; jitter
 FIRST_EPOCHS = 128  # that are aligned at first; four times as many where the car does not move in them
 CASES_AT_ONCE = 32  # bounds the memory
 
@@ -227,7 +227,8 @@ def _first_motion(drive: Drive, config: AlignConfig, earliest: int) -> FirstMoti
         apart = torch.nonzero(drive.gnss_valid[:, :3].all(-1)).flatten().diff().double() * drive.epoch_s
         if len(apart) and (gap := float(apart.median())) > SLOWEST_FIXES_S * max(drive.epoch_s, 1.0):
             mend = f"set epoch_s={math.ceil(gap - SLACK_S)}" if gap <= SLOWEST_START_S else "leave it out"
-            raise InputError(f"drive {drive.name}: fixes are {gap:g} s apart, a start needs one an epoch; {mend}")
+            need = f"velocities at most {REACH_S:g} s apart or positions {FIT_S / 2:g} s"
+            raise InputError(f"drive {drive.name}: fixes are {gap:g} s apart, a start needs {need}; {mend}")
         raise InputError(
             f"drive {drive.name}: never moves faster than {config.min_speed:g} m/s for {config.window_s:g} s "
             "with GNSS, so yaw is unknown; lower align.min_speed or leave the drive out"
