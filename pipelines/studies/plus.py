@@ -5,6 +5,7 @@
     python -m pipelines.studies.plus --parts --real <real> --out outputs/plus_parts    against itself without its parts
     python -m pipelines.studies.plus --oracle --no-auto --sets good fleet others    beside a filter given the true noise
     python -m pipelines.studies.plus --no-auto --rate 10 --sets good fleet others    with IMU samples of 10 Hz
+    python -m pipelines.studies.plus --no-auto --fix-interval 5 --sets good fleet    with a fix every five seconds
 
 Makes the test sets that are missing (below ``--data``), runs every filter compiled over segments with GNSS for 60, 300
 and 900 s and then none for 120 s (real drives: 30 or 60 s), and writes ``table.md`` and ``manifest.json`` (commit,
@@ -97,9 +98,10 @@ class Row:
     groups: list[str]
 
 
-def load(folder: Path, rate_hz: float = 50.0) -> list[Drive]:
-    """Drives of a dataset, samples averaged to ``rate_hz``."""
-    return list(load_dataset(folder, rate_hz=rate_hz, epoch_s=1.0, dtype=torch.float64))
+def load(folder: Path, rate_hz: float = 50.0, fix_s: int = 1) -> list[Drive]:
+    """Drives of a dataset, samples averaged to ``rate_hz``, with a fix every ``fix_s`` seconds."""
+    drives = load_dataset(folder, rate_hz=rate_hz, epoch_s=1.0, dtype=torch.float64)
+    return [replace(d, gnss_valid=d.gnss_valid & (torch.arange(d.epochs + 1) % fix_s == 0)[:, None]) for d in drives]
 
 
 def simulated_cases(name: str, drives: Sequence[Drive]) -> Iterator[Case]:
@@ -289,6 +291,7 @@ def main() -> None:
     arguments.add_argument("--parts", action="store_true", help="against itself without a part")
     arguments.add_argument("--model", default="plus", help="weights: plus, or a folder")
     arguments.add_argument("--rate", type=float, default=50.0, help="of the IMU samples that the filters get [Hz]")
+    arguments.add_argument("--fix-interval", type=int, default=1, help="of the fixes that the filters get [s]")
     arguments.add_argument("--train", action="store_true", help="constants and weights anew, first")
     arguments.add_argument("--out", type=Path, default=Path("outputs/plus"))
     options = arguments.parse_args()
@@ -309,7 +312,7 @@ def main() -> None:
             arguments.error(f"no dataset {name}: {folder} is no folder; real ones need --real")
     rows, digests = [], {}
     for name, folder in folders.items():
-        drives, digests[name] = load(folder, options.rate), dataset_digest(folder)
+        drives, digests[name] = load(folder, options.rate, options.fix_interval), dataset_digest(folder)
         found = {} if options.no_auto or options.parts else found_noise(drives)
         baselines = parts(options.model) if options.parts else {**constants(), **found}
         filters = {**baselines, "plus": trained_filter(options.model)}
@@ -320,8 +323,8 @@ def main() -> None:
             print("\n".join(markdown(rows[-1:])[2:]), flush=True)
     lines = [*markdown(rows), "", *pooled(rows)]
     (options.out / "table.md").write_text("\n".join(lines) + "\n")
-    made = {**describe_provenance(), "rate_hz": options.rate, "simulated": dict(SIMULATED)}
-    made |= {"injected": INJECTED, "digests": digests}
+    made = {**describe_provenance(), "rate_hz": options.rate, "fix_interval_s": options.fix_interval}
+    made |= {"simulated": dict(SIMULATED), "injected": INJECTED, "digests": digests}
     (options.out / "manifest.json").write_text(json.dumps(made, indent=1) + "\n")
     print("\n".join(lines))
 
