@@ -18,19 +18,19 @@ from dlkf.base.errors import did_you_mean
 from dlkf.base.own_process import end_at_once, keep_freed_memory, print_any_letter
 
 COMMANDS = {
-    "simulate": "drives with known truth, as a dataset",
-    "ingest": "foreign logs into a dataset",
-    "doctor": "checks of a dataset before a filter runs",
-    "navigate": "a filter over whole drives, from IMU and GNSS alone: solution, map, exports",
-    "evaluate": "filters against each other on drives with a reference: tables, report",
-    "export": "a filter for a vehicle, as C without libraries",
-    "train": "train a filter and score it against the classical ones",
-    "tune": "fit the noise of a classical filter to drives",
-    "allan": "noise of an IMU from a log at rest",
-    "consistency": "whether a filter's own 1σ are true",
-    "compare": "one page over several evaluations",
-    "register": "the model of a run into the registry",
-    "ui": "MLflow's pages over the runs of this folder",
+    "simulate": "simulate drives with an exact reference, as a dataset",
+    "ingest": "convert logs to a dataset",
+    "doctor": "check a dataset before a filter runs",
+    "navigate": "run a filter over whole drives: solution, map, exports",
+    "evaluate": "compare filters in GNSS outages: tables, report",
+    "export": "write a filter as C code for a vehicle",
+    "train": "train a filter and score it against Kalman filters",
+    "tune": "fit the noise of a Kalman filter to drives",
+    "allan": "identify the noise of an IMU from a log at rest",
+    "consistency": "compute NEES and NIS of a filter on simulated drives",
+    "compare": "put several evaluations on one page",
+    "register": "add a model to the MLflow registry",
+    "ui": "open MLflow on the runs of this folder",
 }
 
 

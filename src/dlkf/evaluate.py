@@ -103,13 +103,13 @@ def evaluate_dataset(settings: EvaluateSettings, console: Console, typed: Sequen
     for reason in done.rules["skipped"].values():
         console.print(f"left out: {reason}", style="yellow")
     for drive, said in done.rules.get(REFUSED, {}).items():
-        console.print(f"drive {drive}: left out as impossible: {said}", style="yellow", highlight=False)
+        console.print(f"drive {drive}: rejected as implausible: {said}", style="yellow", highlight=False)
     if SHORT in done.rules:
         console.print(f"left out: {done.rules[SHORT]}", style="yellow", highlight=False)
     if done.truth:
         console.print(f"No truth: errors are against the {done.truth['reference']}.", style="bold")
     if settings.mode == "auto" and done.rules["mode"] == "drives":
-        said = f"no segment of {settings.length_s:g} s with a known attitude: whole drives, from their own alignment"
+        said = f"no segment of {settings.length_s:g} s with a known attitude: evaluating whole drives, mode=drives"
         console.print(said, style="yellow")
     scores = done.scores
     check_outages(protocol.outage, scores.outage, max(x.span_s for x in fixes.values()))

@@ -60,7 +60,7 @@ def main(config: dict[str, Any]) -> None:
         return
     name, parent = run_name(given.name, overrides), os.environ.get(PARENT_RUN)
     if parent and given.resume and (done := finished_before(folder, data.datasets, config)) and keep_point(uri, done):
-        console.print(f"finished already, in a grid search that broke off: MLflow run {done}")
+        console.print(f"finished already in an interrupted grid search: MLflow run {done}")
         return
     check_fit(settings.fit, data)
     if given.scoring.outage is not None:

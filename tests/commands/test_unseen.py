@@ -30,7 +30,7 @@ def test_an_imu_that_a_model_has_not_met_is_said_and_no_other():
     cards = {"mine": {"imus": ["consumer"]}, "plus": {"imus": []}, "mbkf15": {}}
     assert describe_unseen_imus(cards, ["consumer"]) == []
     (line,) = describe_unseen_imus(cards, ["consumer", "bmi270"])
-    assert line.startswith("mine was trained on the IMU consumer and has not met bmi270")
+    assert line.startswith("mine was trained on the IMU consumer; for bmi270 its accuracy")
 
 
 def test_a_filter_that_listens_says_that_samples_are_too_slow_for_it():

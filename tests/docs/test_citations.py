@@ -86,6 +86,7 @@ def lost_targets(page: Path) -> list[str]:
     lost = [t for t, _ in LINK.findall(text) if "://" not in t and not (page.parent / t).exists()]
     homes = (ROOT, ROOT / "src" / "dlkf")
     lost += [f for f in FILE.findall(text) if not f.startswith("mine/") and not any((h / f).exists() for h in homes)]
+    lost += [a for a in re.findall(r"\]\((#[^)\s]*)\)", text) if a[1:] not in anchors(page)]
     places = [(t, a) for t, a in LINK.findall(text) if a and t.endswith(".md")]
     return lost + [f"{t}{a}" for t, a in places if a[1:] not in anchors(page.parent / t)]
 

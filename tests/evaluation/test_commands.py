@@ -65,9 +65,9 @@ def test_evaluate_leaves_a_report(uri, tmp_path, monkeypatch):
     assert "mode=drives scores whole drives" in " ".join(out.split())
     content = json.loads((tmp_path / "report" / "metrics.json").read_text())
     assert content["protocol"]["mode"] == "segments" and content["protocol"]["imu"] == "consumer"
-    assert content["protocol"]["left out as impossible"] == {"car-01": "1 fix"}
-    assert "drive car-01: left out as impossible: 1 fix" in out
-    assert "left out as impossible" in (tmp_path / "report" / "report.html").read_text()
+    assert content["protocol"]["rejected as implausible"] == {"car-01": "1 fix"}
+    assert "drive car-01: rejected as implausible: 1 fix" in out
+    assert "rejected as implausible" in (tmp_path / "report" / "report.html").read_text()
     assert content["results"][0]["count"]["outages"] == 6 == len(content["results"][0]["per_outage"])
     assert (tmp_path / "report" / "figures" / "error_over_time.png").stat().st_size > 10_000
 
@@ -78,6 +78,6 @@ def test_navigate_writes_solutions_without_a_reference(call, tmp_path):
     done = call("navigate", "model=mbkf15", "dataset=town", "out=solved", "rate_hz=20", "drives=[car-01]")
     assert done.code == 0, done.err
     assert "car-01: solution from t = " in done.out
-    assert "Left out as impossible: 1 fix of car-01." in (tmp_path / "solved" / "report.html").read_text()
+    assert "Rejected as implausible: 1 fix of car-01." in (tmp_path / "solved" / "report.html").read_text()
     assert pq.read_schema(tmp_path / "solved" / "drive=car-01" / "solution.parquet").equals(GEO_SCHEMA)
     assert sorted(p.name for p in (tmp_path / "solved").iterdir()) == ["drive=car-01", "log.txt", "report.html"]

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import subprocess
 import sys
 import zipfile
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 import torch
+from pipelines.studies import logs as car_logs
 from pipelines.studies import other_cars
 from scipy.io import savemat
 
@@ -40,7 +43,7 @@ def sensed(t: np.ndarray, to_frd: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def place(way: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Latitude and longitude [°]."""
-    metre = 1 / other_cars.DEGREE_M
+    metre = 1 / car_logs.DEGREE_M
     return LAT + way.real * metre, LON + way.imag * metre / np.cos(np.radians(LAT))
 
 
@@ -106,7 +109,7 @@ def write_amz(logs: Path) -> None:
     accel, gyro = sensed(t, np.diag([1, -1, -1]))
     seen = late[np.maximum(np.arange(len(late)) - 1 + np.arange(len(late)) % 2, 0)] - 0.1
     lat, lon = place(at(seen, WAY + ARM * np.exp(1j * YAW)))
-    v = at(fast, SPEED + 1j * RATE * other_cars.OPTICAL_SENSOR)
+    v = at(fast, SPEED + 1j * RATE * car_logs.OPTICAL_SENSOR)
     log = dict(zip(("a_x", "a_y", "a_z", "wXsens", "wYsens", "wZsens"), (*accel, *gyro)))
     log |= {"lat": lat, "long": lon, "lin_v_x": v.real, "lin_v_y": -v.imag}
     savemat(folder / "AMZ_data_non_resample.mat", {"d": log})
@@ -142,23 +145,96 @@ def write_dresden(logs: Path) -> None:
     write(logs / "balzer82/Kalman/2014-03-26-000-Data.csv", pd.DataFrame(table))
 
 
+def write_boston(logs: Path) -> None:
+    """A drive as those of ``nuance`` beside them; one whose fixes are known by the times of their arrival alone."""
+    write_nuance(logs)
+    top = logs / "freecode23/EECE5554"
+    for kind, folder in (("imu", "integration_ws/data/town_imu"), ("gps", "lab5/data/town")):
+        (top / folder).mkdir(parents=True)
+        (top / f"lab5/data/first_test/town_{kind}.csv").rename(top / folder / f"town_{kind}.csv")
+    folder = logs / "MakiseYuki/EECE5554_Robotic-and-Navigation/lab3/MATLAB files"
+    folder.mkdir(parents=True)
+    t, seconds = np.arange(0.02, END_S, 0.025), np.arange(1.0, END_S - 1)
+    lat, lon = place(at(seconds, WAY))
+    arrived = 1e6 * (BASE_S + seconds + 0.02 + 0.005 * np.sin(5 * seconds))
+    savemat(folder / "testdrive_gps.mat", {"data": np.column_stack([arrived, lat, -lon, 0 * lat + 50.0])})
+    imu = np.column_stack([BASE_S + t, np.zeros((len(t), 6)), np.concatenate(sensed(t, np.eye(3))).T])
+    savemat(folder / "testdrive_imu.mat", {"data": imu})
+
+
+def write_beijing(logs: Path) -> None:
+    """Right-Forward-Up and turned in the car; rows of RTK beside the fixes; the two layouts of the files."""
+    t, half = np.arange(0.01, END_S, 0.01), np.arange(1.0, END_S - 1, 0.5)
+    (lat, lon), v = place(at(half, WAY)), at(half, SPEED * np.exp(1j * YAW))
+    for k, (path, _, delay_s, yaw_deg) in enumerate(car_logs.BEIJING.values()):
+        file = logs / "yandld/nav_matlab" / path
+        file.parent.mkdir(parents=True, exist_ok=True)
+        turn = rotation_from_rpy(torch.tensor([0.0, 0.0, np.radians(yaw_deg)], dtype=torch.float64)).numpy()
+        right_forward_up = np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1]])
+        imu = np.column_stack([BASE_S + t, *np.concatenate(sensed(t, turn @ right_forward_up))])
+        one, up = np.ones(len(half)), 0.2
+        sigma = [1.5 * one, 1.4 * one, 2.5 * one, 0.12 * one, 0.11 * one, up * one]
+        gnss = np.column_stack(
+            [BASE_S + half + delay_s, one, 9 * one, lat, lon, 50 * one, v.imag, v.real, 0 * one, *sigma]
+        )
+        rtk = gnss * np.where(np.arange(15) == 1, 4, np.where((np.arange(15) > 5) & (np.arange(15) < 9), 7, 1))
+        gnss = np.stack([gnss, rtk], 1).reshape(-1, 15)
+        ins = {
+            "time": BASE_S + half,
+            "lat": lat,
+            "lon": lon,
+            "alt": 50 * one,
+            "vel": np.column_stack([v.imag, v.real, 0 * one]),
+        }
+        if k % 2:
+            gnss[:, 0], imu[:, 0] = 1e3 * gnss[:, 0], 1e3 * imu[:, 0]
+        else:
+            gnss[:, 3:5] = np.radians(gnss[:, 3:5])
+            gnss, imu = (np.column_stack([np.zeros(len(x)), x]) for x in (gnss, imu))
+        savemat(file, {"gnss_data": gnss, "imu_data": imu, "span": ins})
+
+
+def write_kth(logs: Path) -> None:
+    """Metres from a place of which only the latitude matters."""
+    file = logs / "yandld/nav_matlab/library/nav_lib/loose_gps_imu/dataset1.mat"
+    file.parent.mkdir(parents=True, exist_ok=True)
+    t, seconds = np.arange(0.01, END_S, 0.01), np.arange(1.0, END_S - 1)
+    lat, lon = place(at(seconds, WAY))
+    from_place = np.stack([lat - 59.35, (lon - 18.07) * np.cos(np.radians(59.35)), 0 * lat]) * car_logs.DEGREE_M
+    accel, gyro = sensed(t, np.eye(3))
+    gnss = {"pos_ned": from_place, "time": seconds, "HDOP": 0 * lat + 1.2, "VDOP": 0 * lat + 2.0}
+    savemat(file, {"dataset": {"gnss": gnss, "imu": {"time": t, "acc": accel, "gyro": gyro}}})
+
+
 WRITERS = {
     "nuance": write_nuance,
     "kingston": write_kingston,
     "amz": write_amz,
     "beersheva": write_beersheva,
     "dresden": write_dresden,
+    "boston": write_boston,
+    "beijing": write_beijing,
+    "kth": write_kth,
 }
+COUNTS = {"nuance": 2, "boston": 3, "beijing": 7}
+
+
+@pytest.fixture(autouse=True)
+def _short(monkeypatch):
+    """Of the recording that is cut, two parts within the known drive."""
+    monkeypatch.setattr(car_logs, "USABLE_2019_S", ((0, 60), (60, 120)))
 
 
 @pytest.mark.parametrize("name", other_cars.LOGS)
 def test_axes_signs_and_clocks_of_a_log(name, tmp_path):
     WRITERS[name](tmp_path)
     drives = list(other_cars.LOGS[name].read(tmp_path))
-    assert len(drives) == (2 if name == "nuance" else 1)
+    assert len(drives) == COUNTS.get(name, 1)
     for drive in drives:
         t = drive.imu["t"].to_numpy()
-        tilt = 0.2 if name in ("beersheva", "dresden") else 0.03  # levelled by the mean, which holds some acceleration
+        tilt = (
+            0.2 if name in ("beersheva", "dresden", "beijing") else 0.03
+        )  # levelled by the mean, which holds some acceleration
         np.testing.assert_allclose(drive.imu[list(ACCEL)], at(t, FORCE), atol=tilt)
         np.testing.assert_allclose(drive.imu["gyro_z"], at(t, RATE), atol=0.005)
         np.testing.assert_allclose(drive.imu[list(GYRO[:2])], 0, atol=0.01)
@@ -166,7 +242,7 @@ def test_axes_signs_and_clocks_of_a_log(name, tmp_path):
         for table, truth, within in ((drive.gnss, antenna, 0.1), (drive.reference, WAY, 0.2)):
             rows = table[(table["t"] > 5) & (table["t"] < END_S - 5)]
             lat, lon = place(at(rows["t"].to_numpy(), truth))
-            away = (rows[list(POSITION[:2])].to_numpy() - np.stack([lat, lon], -1)) * other_cars.DEGREE_M
+            away = (rows[list(POSITION[:2])].to_numpy() - np.stack([lat, lon], -1)) * car_logs.DEGREE_M
             assert np.abs(away).max() < within, (name, np.abs(away).max())
         rows = drive.reference[(drive.reference["t"] > 5) & (drive.reference["t"] < END_S - 5)]
         v = at(rows["t"].to_numpy(), SPEED * np.exp(1j * YAW))
@@ -177,9 +253,9 @@ def test_axes_signs_and_clocks_of_a_log(name, tmp_path):
 
 
 def test_what_single_logs_know(tmp_path):
-    for writer in WRITERS.values():
-        writer(tmp_path)
-    read = {name: list(log.read(tmp_path))[-1] for name, log in other_cars.LOGS.items()}
+    for name, writer in WRITERS.items():
+        writer(tmp_path / name)
+    read = {name: list(log.read(tmp_path / name))[-1] for name, log in other_cars.LOGS.items()}
     arm = complex(read["amz"].meta["lever_arm_x_m"], read["amz"].meta["lever_arm_y_m"])
     assert abs(arm - ARM) < 0.05
     assert read["kingston"].gnss["height_m"].mean() == pytest.approx(39)
@@ -188,6 +264,14 @@ def test_what_single_logs_know(tmp_path):
     np.testing.assert_allclose(np.exp(1j * yaw), np.exp(1j * turned), atol=0.02)
     assert read["nuance"].gnss["height_m"].mean() == pytest.approx(16.6 - 33.8)
     assert read["nuance"].gnss[list(STD[:3])].mean().tolist() == pytest.approx([1.2, 1.2, 1.8])
+    fixes = read["beijing"].gnss
+    assert fixes["t"].diff().dropna().to_numpy() == pytest.approx(1.0) and (fixes["quality"] == 1).all()
+    assert fixes[[*STD[:2], *STD[3:5]]].mean().tolist() == pytest.approx([1.4, 1.5, 0.11, 0.12])
+    assert fixes["vel_n"].abs().max() < 14
+    assert read["kth"].gnss[list(STD[:3])].mean().tolist() == pytest.approx([1.2, 1.2, 2.0])
+    assert [x.gnss["t"].iloc[0] for x in other_cars.LOGS["boston"].read(tmp_path / "boston")] == pytest.approx(
+        [1, 1, 61], abs=0.01
+    )
     assert read["dresden"].gnss["vel_n"].notna().all() and read["beersheva"].gnss["vel_n"].isna().all()
 
 
@@ -200,9 +284,23 @@ def test_a_dataset_is_written_and_its_reference_is_found(name, tmp_path):
         assert float(drive.ref_valid.double().mean()) > 0.95
 
 
+def test_a_file_of_an_older_commit_is_read(tmp_path):
+    folder = tmp_path / "someone" / "cars"
+    folder.mkdir(parents=True)
+    run = partial(subprocess.run, check=True, capture_output=True, cwd=folder, text=True)
+    run(["git", "init", "-q"])
+    (folder / "log.csv").write_text("t\n1\n")
+    blob = run(["git", "hash-object", "-w", "log.csv"]).stdout.strip()
+    assert car_logs.stored(tmp_path, "someone/cars", "log.csv", blob) == folder / "log.csv"
+    (folder / "log.csv").unlink()
+    for _ in range(2):
+        found = car_logs.stored(tmp_path, "someone/cars", "log.csv", blob)
+        assert found.suffix == ".csv" and found.read_text() == "t\n1\n"
+
+
 def test_a_turned_sensor_is_refused(tmp_path, monkeypatch):
     write_kingston(tmp_path)
-    monkeypatch.setattr(other_cars, "RFU", np.array([[1, 0, 0], [0, -1, 0], [0, 0, -1]]))
+    monkeypatch.setattr(car_logs, "RFU", np.array([[1, 0, 0], [0, -1, 0], [0, 0, -1]]))
     with pytest.raises(InputError):
         other_cars.convert("kingston", tmp_path, tmp_path / "out")
 
@@ -218,6 +316,7 @@ def test_the_whole_study_on_one_log(tmp_path, monkeypatch, capsys):
     other_cars.main()
     head, _, *rows = (tmp_path / "out" / "table.md").read_text().splitlines()
     assert head.startswith("| log | GNSS [s] | outage [s] | outages | mbkf33_car any_car |")
-    cells = [row.split(" | ")[:4] for row in rows]
+    cells = [row.split(" | ")[:4] for row in rows[:2]]
     assert cells == [["| `kingston`", "45", "30", "2"], ["| `kingston`", "45", "60", "1"]]
+    assert rows[-1] == "| 45 | 3 (1) | 1.00; 1.00 | 1.00; 1.00 |"  # the same filter
     assert "digests" in (tmp_path / "out" / "manifest.json").read_text() and rows[0] in capsys.readouterr().out

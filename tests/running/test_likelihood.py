@@ -158,7 +158,7 @@ def test_navigate_finds_the_noise_by_itself(call, long_town, coarse):
 
 
 @pytest.mark.parametrize("words,says", [
-    (("navigate", "model=plus", "imu=auto", "out=a"), "model=plus takes none"),
+    (("navigate", "model=plus", "imu=auto", "out=a"), "model=plus has no such noise"),
     (("navigate", "model=mbkf15", "imu=auto", "streaming=true", "out=a"), "looks ahead"),
     (("evaluate", "model=mbkf15", "imu=auto", "out=a"), "only navigate finds the noise"),
 ])  # fmt: skip
@@ -169,7 +169,7 @@ def test_where_noise_cannot_be_found(call, long_town, words, says):
 
 def test_drives_that_say_nothing_are_refused(drives):
     short = [d.part(0, 15) for d in drives]
-    with pytest.raises(InputError, match="no noise can be found"):
+    with pytest.raises(InputError, match="cannot estimate the noise"):
         find_noise(Evidence.of(short), "mbkf15", IMU, Tuning())
 
 

@@ -62,7 +62,7 @@ class Drive:
     ref_valid: Tensor  # (N+1,) bool: position and velocity may be scored
     ref_imu_error: Tensor  # (N+1, 6) float64, NaN unless the source (a simulation) has it
     lever_arm_b: Tensor  # (3,) m, IMU → antenna
-    refused: Refused = NONE_REFUSED  # rows of its tables that were left out as impossible
+    refused: Refused = NONE_REFUSED  # rows of its tables that were rejected as implausible
     aids: Mapping[str, Tensor] = field(default_factory=dict)  # (N+1, 5) of further sensors, see dlkf.data.aids.ROW
 
     @property

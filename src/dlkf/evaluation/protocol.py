@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 Item = TypeVar("Item")
 MODES = ("auto", "segments", "drives")
 LONG_S, STEP_S = 600, 30  # of long segments: the longest, and what they are shortened by
-REFUSED = "left out as impossible"  # of the rules: samples and fixes of drives
+REFUSED = "rejected as implausible"  # of the rules: samples and fixes of drives
 
 
 @dataclass(frozen=True)

@@ -29,10 +29,12 @@ def read_card(folder: Path) -> dict[str, Any]:
     for key in LISTS:
         names = values.get(key) or []
         if not isinstance(names, list) or not all(isinstance(name, (str, int, float)) for name in names):
-            raise InputError(f"{path}: {key} must be a list of names; take the card of this model again")
+            raise InputError(f"{path}: {key} must be a list of names; replace it by the card.yaml that training wrote")
     datasets = values.get("datasets") or {}
     if not isinstance(datasets, dict) or not all(isinstance(x, str) for pair in datasets.items() for x in pair):
-        raise InputError(f"{path}: datasets must be names with their digests; take the card of this model again")
+        raise InputError(
+            f"{path}: datasets must be names with their digests; replace it by the card.yaml that training wrote"
+        )
     return values
 
 
@@ -58,8 +60,8 @@ def describe_unseen_imus(cards: Mapping[str, Mapping[str, Any]], imus: Iterable[
         known = set(card.get("imus") or ())
         if known and (unmet := sorted(set(imus) - known)):
             lines.append(
-                f"{name} was trained on the IMU {', '.join(sorted(known))} and has not met {', '.join(unmet)}: "
-                "its accuracy is not validated there"
+                f"{name} was trained on the IMU {', '.join(sorted(known))}; for {', '.join(unmet)} its accuracy "
+                "is not validated"
             )
     return lines
 
@@ -146,4 +148,4 @@ def card_of_tuning(models: Iterable[str], tuning: Tuning) -> dict[str, dict[str,
 
 def describe_seen_recordings(name: str, seen: int, of: int, remedy: str, how: str = TRAINED) -> str:
     """A line for a model that is scored on recordings of its training."""
-    return f"{name} was {how} on {seen} of these {of} recordings, which flatters it; {remedy}"
+    return f"{name} was {how} on {seen} of these {of} recordings, so its errors are too small; {remedy}"

@@ -89,7 +89,7 @@ def check_columns(name: str, frame: pd.DataFrame, needed: Sequence[str]) -> None
     elif {c.strip() for c in columns} >= set(needed):
         remedy = f"its names have blanks around them; {name}.rename(columns=str.strip)"
     elif len(renamed) == len(missing):
-        remedy += f"; {name}.rename(columns={renamed}), units of the contract (dlkf.read_logs finds names and units)"
+        remedy += f"; {name}.rename(columns={renamed}) if its units are those of docs: Data; else dlkf.read_logs"
     else:
         remedy += "; dlkf.read_logs reads logs with other names and units"
     raise InputError(f"{name}: column {', '.join(missing)} missing; {remedy}")
@@ -122,7 +122,7 @@ def warn_of_other_columns(gnss: pd.DataFrame) -> None:
     }
     if unused:
         names, wanted = ", ".join(unused), ", ".join(dict.fromkeys(unused.values()))
-        line = f"gnss: columns {names} are not used; the contract's names are {wanted}, … (docs: Data)"
+        line = f"gnss: columns {names} are not used; a dataset has the names {wanted}, … (docs: Data)"
         warnings.warn(line, UserWarning, stacklevel=6)
 
 
@@ -229,8 +229,8 @@ def check_lever_arm(lever_arm: Any) -> tuple[float, float, float]:
             f"lever_arm is {_shorten(lever_arm)}, must be three numbers: IMU → antenna, Forward-Right-Down [m]"
         )
     if np.abs(arm).max() > LEVER_ARM_M:
-        far = f"{np.abs(arm).max():g} m away"
-        raise InputError(f"lever_arm is {_shorten(lever_arm)}: an antenna {far}; metres are meant")
+        far = f"{np.abs(arm).max():g} m"
+        raise InputError(f"lever_arm is {_shorten(lever_arm)}: the antenna would be {far} from the IMU; give metres")
     return (float(arm[0]), float(arm[1]), float(arm[2]))
 
 

@@ -24,11 +24,12 @@ class Evaluation:
     headline : str
         How far the best filter drifts in the outages, in one sentence.
     warnings : list of str
-        A line for each filter whose 1σ does not fit its innovations, with the remedy, and for one that the drive's
-        sample rate is too low for.
+        A line with the remedy for each filter whose 1σ does not fit its innovations, and a line for each filter for
+        which the drive's sample rate is too low.
     table : pandas.DataFrame
-        A row per filter: horizontal error at the end of the outages, RMS, median and 95 % [m], drift [% of distance],
-        the filter's own horizontal 1σ at the end (median) [m], innovations over their 1σ (RMS).
+        A row per filter: horizontal error at the end of the outages (``end_rms_m``, ``median_m``, ``p95_m``), drift
+        per distance (``drift_percent``), the filter's own horizontal 1σ at the end (median, ``own_sigma_m``),
+        innovations over their 1σ (RMS, ``innovation_per_sigma``).
     outages : pandas.DataFrame
         A row per outage: t_start [s], length_s, distance_m, and the horizontal error of every filter at its end [m].
     results : Results
@@ -103,7 +104,8 @@ def evaluate(
     models : str or sequence of str
         Filters to compare, as ``model`` of :func:`dlkf.frames.navigation.navigate`.
     outage_s : float
-        Length of an outage [s]; the next begins after as long with GNSS.
+        Length of an outage [s]. The first begins after 60 s with GNSS, the next after ``outage_s`` with GNSS; a second
+        run is shifted by ``outage_s``, so that the outages cover the drive.
     imu_type, tuning, prior : str or mapping
         As in :func:`dlkf.frames.navigation.navigate`.
     lever_arm : sequence of 3 floats

@@ -40,8 +40,8 @@ def simulate(
     seed : int
         The same seed gives the same drives.
     imu_type : str, optional
-        A preset of ``conf/imu``; default: the preset's own. Of ``fleet`` and ``other_imus``, which draw the type of
-        each drive, none.
+        A preset of ``conf/imu``; default: the preset's own. Not for ``fleet`` and ``other_imus``, which draw the IMU
+        type of each drive.
 
     Returns
     -------
@@ -51,7 +51,7 @@ def simulate(
     Raises
     ------
     InputError
-        For a preset that does not exist, and for no time or no drives.
+        For a preset that does not exist, and ``minutes`` or ``drives`` out of range.
     """
     from dlkf.command.simulated import SEMI_REAL, compose_recipe
     from dlkf.data.readers.frames import DriveFrames
@@ -100,8 +100,8 @@ def read_logs(
     *settings : str
         What is known, as on the command line: ``"reader.imu.accel.unit=g"``, ``"reader.gnss.time.offset_s=0.3"``.
     skip_unsure : bool
-        Leave out drives that cannot be read or have too little motion for what is to be found, with a warning; else
-        the first is an error.
+        Skip drives that cannot be read, or that have too little motion for the estimates, with a warning; otherwise
+        the first one is an error.
 
     Returns
     -------

@@ -87,7 +87,7 @@ def navigate(
     Raises
     ------
     InputError
-        For frames that break the contract, a filter that does not exist, or a drive that cannot be aligned.
+        For frames with wrong columns or values, a filter that does not exist, or a drive that cannot be aligned.
 
     Warns
     -----

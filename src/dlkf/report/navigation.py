@@ -99,7 +99,7 @@ def summary_lines(model: str, courses: Sequence[TrackOnMap]) -> list[str]:
         text += " This filter gives no 1σ."
     refused = [f"{c.result.refused} of {c.result.drive}" for c in courses if any(c.result.refused)]
     more = f" and of {len(refused) - FEW_NAMED} more drives" if len(refused) > FEW_NAMED else ""
-    said = [f"Left out as impossible: {', '.join(refused[:FEW_NAMED])}{more}."] if refused else []
+    said = [f"Rejected as implausible: {', '.join(refused[:FEW_NAMED])}{more}."] if refused else []
     return [lead, text, *vibration_lines(courses), *said]
 
 

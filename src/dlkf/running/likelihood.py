@@ -150,7 +150,7 @@ class Evidence:
         parts = [d.part(0, min(d.epochs, math.ceil(seconds / d.epoch_s))) for d in chosen]
         aligned = [(d, s) for d, s in zip(parts, align_each(parts, align)) if not isinstance(s, InputError)]
         if not aligned:
-            raise InputError("no noise can be found: none of the drives can be aligned")
+            raise InputError("imu=auto cannot estimate the noise: none of the drives can be aligned")
         kinds = 1 + len(GAPS_S)
         repeated = [both for both in aligned for _ in range(kinds)]
         batch = whole_drives([d for d, _ in repeated], [s for _, s in repeated])
@@ -291,7 +291,8 @@ def find_noise(
 
     before = score(x, NO_OFFSET) if evidence.fixes else math.inf
     if not math.isfinite(before):
-        raise InputError("no noise can be found: it takes two minutes with fixes, and a filter that does not diverge")
+        need = "two minutes with fixes, and a filter that does not diverge"
+        raise InputError(f"imu=auto cannot estimate the noise: it needs {need}")
     x, placing, best = search(x, NO_OFFSET, before, STEPS, shifts if delay else ())
     unknown = FixOffset(math.nan, math.nan)
     if not delay:
@@ -307,8 +308,8 @@ def find_noise(
 def check_finds_noise(name: str) -> None:
     """InputError for ``imu=auto`` with a filter that takes no noise, or more than noise."""
     if not is_filter(name) or name == "ins" or has_prior(name):
-        what = "imu=auto finds the noise of a Kalman filter"
-        raise InputError(f"{what}, model={name} takes none; give a preset or leave imu out, or take model=mbkf21_nhc")
+        what = f"imu=auto estimates the noise of Kalman filters, and model={name} has no such noise"
+        raise InputError(f"{what}: leave imu out, give a preset, or use model=mbkf21_nhc")
 
 
 def generic_filter(

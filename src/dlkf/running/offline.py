@@ -91,7 +91,7 @@ def choose_epoch(spacings: Iterable[UsableFixes], rate_hz: float, estimator: Fil
     """Update interval [s] that uses every fix: the closest usual spacing.
 
     1 s where it is no whole number of IMU samples, and at least for filters with constraints, whose noise is meant for
-    one a second. Of slow receivers that spacing in whole seconds, for a start needs a fix in every interval.
+    one a second. Of slow receivers that spacing in whole seconds.
     """
     closest = min((s.usual_s for s in spacings), default=1.0)
     if SLOWEST_FIXES_S < closest <= SLOWEST_START_S:
@@ -112,7 +112,7 @@ class Navigated:
     aligned_at: float
     table: pd.DataFrame
     innovation: Innovation | None = None
-    refused: Refused = NONE_REFUSED  # samples and fixes that were left out as impossible
+    refused: Refused = NONE_REFUSED  # samples and fixes that were rejected as implausible
     restarts: tuple[float, ...] = ()  # times [s] at which the filter was lost and restarted
     doubt: float = 0.0
 
@@ -139,7 +139,7 @@ class Navigated:
             text += f", normalised innovation RMS {spread:.2g} (expected 1)"
         text += "".join(f", {found}" for found in self.sensors().values())
         if any(self.refused):
-            text += f", left out as impossible: {self.refused}"
+            text += f", rejected as implausible: {self.refused}"
         if self.restarts:
             text += ", lost and started over at t = " + ", ".join(self._describe_restart(t) for t in self.restarts[:5])
             text += " s"

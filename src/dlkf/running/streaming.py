@@ -7,9 +7,8 @@ solution to rounding, for any order in which fixes arrive:
 * **Epochs** close with the first IMU sample at or after their end; the fixes that have come by then are used.
 * **Fixes** that come later, as they do from every receiver, roll the filter back to the epoch they belong to and
   replay it, if that lies within ``history_s``. Of several fixes in an epoch the latest counts.
-* **The grid** is laid through the fixes of the first ``SETTLE_S``; a stream does not know those to come. It differs
-  from a log's by what those fixes scatter; ``phase_s`` (and ``imu_step_s``, the usual interval between samples)
-  give it from outside.
+* **The grid** is aligned with the fixes of the first ``SETTLE_S``. A log uses all its fixes, so the two grids differ by
+  the scatter of these first ones; ``phase_s`` and ``imu_step_s`` (the nominal sample interval) set the grid explicitly.
 * **The start** is the rule of :func:`dlkf.running.start.align` without look-ahead, applied to the epochs as they
   come. Until the car moves under GNSS, and while it is in doubt which way it faces (``doubt``), there are no estimates.
 * **Bad packets** (not finite, out of range, time that runs back, twice the same, too late) are refused with a reason
@@ -66,7 +65,7 @@ ANCHOR_M = 50_000.0  # from its origin, beyond which the tangent frame moves
 SETTLE_S = 3.0  # fixes over so long lay the grid
 MOST_EARLY_SAMPLES = 10_000  # of further sensors
 FIXES_OVER = f"fixes over {SETTLE_S:.0f} seconds"
-MOTION = f"the car to move under GNSS, with velocities at most {REACH_S:g} s apart or positions {FIT_S / 2:g} s"
+MOTION = f"the car to move under GNSS, with velocities at most {REACH_S:g} s or positions at most {FIT_S / 2:g} s apart"
 FIRST_OF_FIXES, FIRST_OF_AIDS = 0, 1  # boundaries at which they can count
 
 
@@ -100,8 +99,8 @@ class StreamingFilter:
     often each status was returned (samples that are taken do not count), how many samples proved to be spikes
     (``spikes``), how often the state was no longer finite (``diverged``), and how often the filter was lost (``lost``,
     at the times ``lost_at``). For one thread at a time.
-    Raises InputError if the filter cannot work on such a grid, and warns (LowSampleRateWarning) where it would take
-    features from samples that come too seldom for that.
+    Raises InputError if the filter cannot run on this grid. Warns (LowSampleRateWarning) if the sample rate is too low
+    for its full accuracy.
     """
 
     def __init__(
@@ -175,8 +174,8 @@ class StreamingFilter:
 
     @property
     def doubt(self) -> float:
-        """Probability that the best heading is wrong while the filter waits for one: 1 before the car moves; once the
-        filter runs, what was left when it began."""
+        """Probability that the most likely heading is wrong: 1 before the car moves; once the filter runs, its value
+        when it started."""
         if isinstance(self._epochs.running, Search):
             return self._epochs.running.doubt
         return 1.0 if self.aligning else self._epochs.start_doubt

@@ -130,7 +130,7 @@ def search(
 ) -> TuningResult:
     """Fit on ``drives["train"]``, then errors before and after on both sides; ``prior`` of a filter with ``_prior``."""
     if protocol.outage is None and objective != PVA:
-        raise InputError(f"objective={objective} is of outages and outage=null has none; give objective={PVA}")
+        raise InputError(f"objective={objective} scores outages, but outage=null has none; give objective={PVA}")
     left_out: list[str] = []
     training = withhold_outages(drives["train"], protocol, segments, left_out)
     after, _, trials = tune_under_bar(imu, training, model, rounds, start=start, objective=objective, prior=prior)

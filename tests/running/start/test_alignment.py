@@ -347,7 +347,7 @@ def test_what_cannot_be_aligned_is_told(drive):
     with pytest.raises(InputError, match="drive car-0: no GNSS fix"):
         align(replace(drive, gnss_valid=torch.zeros_like(drive.gnss_valid)))
     seldom = drive.gnss_valid & (torch.arange(len(drive.gnss_valid)) % 6 == 0).unsqueeze(-1)
-    with pytest.raises(InputError, match="fixes are 6 s apart, a start needs velocities at most 5 s apart"):
+    with pytest.raises(InputError, match="fixes are 6 s apart, a start needs velocities at most 5 s or"):
         align(replace(drive, gnss_valid=seldom))
 
 

@@ -420,7 +420,7 @@ const char *dlkf_says(dlkf_status status) {
 
 const char *dlkf_waits_for(dlkf_waiting waiting) {
   static const char *const words[] = {"nothing", "samples of the IMU", "fixes over 3 seconds",
-                                      "the car to move under GNSS, with velocities at most 5 s apart or positions 2.5 s",
+                                      "the car to move under GNSS, with velocities at most 5 s or positions at most 2.5 s apart",
                                       "motion that determines the heading"};
   return (unsigned)waiting < sizeof words / sizeof *words ? words[waiting] : "no such thing";
 }

@@ -226,8 +226,8 @@ def _first_motion(drive: Drive, config: AlignConfig, earliest: int) -> FirstMoti
     if row is None:
         apart = torch.nonzero(drive.gnss_valid[:, :3].all(-1)).flatten().diff().double() * drive.epoch_s
         if len(apart) and (gap := float(apart.median())) > SLOWEST_FIXES_S * max(drive.epoch_s, 1.0):
-            mend = f"set epoch_s={math.ceil(gap - SLACK_S)}" if gap <= SLOWEST_START_S else "leave it out"
-            need = f"velocities at most {REACH_S:g} s apart or positions {FIT_S / 2:g} s"
+            mend = f"set epoch_s={math.ceil(gap - SLACK_S)}" if gap <= SLOWEST_START_S else "leave the drive out"
+            need = f"velocities at most {REACH_S:g} s or positions at most {FIT_S / 2:g} s apart"
             raise InputError(f"drive {drive.name}: fixes are {gap:g} s apart, a start needs {need}; {mend}")
         raise InputError(
             f"drive {drive.name}: never moves faster than {config.min_speed:g} m/s for {config.window_s:g} s "
