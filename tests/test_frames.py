@@ -77,7 +77,7 @@ def test_numbers_of_other_types_and_columns_of_other_names(drive):
     usual = dlkf.navigate(drive["imu"], gnss, model="ins", rate_hz=10)
     pd.testing.assert_frame_equal(pd.DataFrame(dlkf.navigate(imu, odd, model="ins", rate_hz=10)), pd.DataFrame(usual))
     with pytest.warns(
-        UserWarning, match="gnss: columns vn, hacc are not used; the contract's names are vel_n, std_pos_n"
+        UserWarning, match="gnss: columns vn, hacc are not used; a dataset has the names vel_n, std_pos_n"
     ):
         dlkf.navigate(imu, gnss[["t", *POSITION]].assign(vn=gnss.vel_n, hacc=0.1), model="ins", rate_hz=10)
     with pytest.warns(UserWarning, match="plus has its own noise"):
