@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -82,7 +83,7 @@ def test_h_is_the_derivative_of_what_is_predicted(segments, name):
     source = kind(IMU, Tuning(), states)
     rows = {"speed": [14.0, 0.0, 0.4, 0.5, 8.0], "heading": [0.3, 0, 0.2, 0, 1], "baro": [320.0, 0, 0.4, 0.5, 5]}
     said = {name: torch.tensor([rows[name]] * 3, dtype=torch.float64)}
-    at = {n: torch.full((3,), x, dtype=torch.float64) for n, x in zip(kind.parameters, (0.02, 0.08, 0.4))}
+    at = {n: torch.full((3,), x, dtype=torch.float64) for n, x in zip(kind.parameters, (0.02, 0.08, 0.4, 0.1))}
     prediction = Predicted(torch.eye(states.count, dtype=torch.float64).expand(3, -1, -1), parameters=at)
     memory = source.begin(segments)
     zero = ImuError(torch.zeros(3, 6).double())
@@ -101,7 +102,7 @@ def test_h_is_the_derivative_of_what_is_predicted(segments, name):
         linear = (found.H @ dx.unsqueeze(-1)).squeeze(-1)
         change = found.z - moved.z
         assert torch.allclose(change, linear, atol=2e-3, rtol=2e-2)
-    for n, step in zip(kind.parameters, (1e-3, 1e-3, 1e-2)):
+    for n, step in zip(kind.parameters, (1e-3, 1e-3, 1e-2, 1e-2)):
         moved, _ = source.rows(here, memory, prediction._replace(parameters={**at, n: at[n] + step}))
         slope = (found.z - moved.z) / step
         assert torch.allclose(slope, found.H[..., states.of(n)].squeeze(-1), atol=5e-2, rtol=1e-2)
@@ -138,6 +139,70 @@ def test_all_three_agree_with_the_car(aided):
     assert abs(said["baro_offset_m"][-1] - 30) < 0.5 and abs(said["heading_offset"][-1]) < 0.005
 
 
+def _estimates(aided, name: str, change):
+    """What a filter says of a sensor whose rows (B, T, 5) are changed: by column, over time."""
+    model = with_aids(build_filter("mbkf21_car", IMU), [STANDARD[name]])
+    rows = aided.aids[name].clone()
+    rows[..., 0] = torch.where(rows[..., 4] > 0, change(rows[..., 0]), 0.0)
+    changed = replace(aided, aids={**aided.aids, name: rows})
+    return dict(zip(aid_columns(model), integrate(changed, model).aids[0].T))
+
+
+def test_the_offset_of_a_displayed_speed_is_found(aided):
+    said = _estimates(aided, "speed", lambda v: v + 0.5 * torch.sign(v))
+    assert abs(said["wheel_offset"][-1] - 0.5) < 0.1 and said["speed_used"][10:-2].all()
+    assert abs(said["wheel_scale"][-1] - 0.03) < 0.01
+
+
+def test_a_barometer_feels_the_speed(aided):
+    v = aided.truth.v_n[..., :2].square().sum(-1)
+    said = _estimates(aided, "baro", lambda h: h + 0.2 * v / (2 * 9.81))
+    assert abs(said["baro_wind"][-1] - 0.2) < 0.04 and abs(said["baro_offset_m"][-1] - 30) < 1
+    assert abs(_estimates(aided, "baro", lambda h: h)["baro_wind"][-1]) < 0.04
+
+
+def test_a_heading_that_scatters_more_than_it_says_gets_a_larger_sigma(aided):
+    noise = math.radians(3) * torch.randn(aided.size[:2], generator=torch.Generator().manual_seed(0)).double()
+    said = _estimates(aided, "heading", lambda y: y + noise)
+    late = said["heading_innovation"].isfinite() & (torch.arange(len(noise[0])) > 60)
+    assert said["heading_used"][late].double().mean() > 0.95
+    assert 2 < math.degrees(said["heading_innovation_std"][late].median()) < 5
+    off = _estimates(aided, "heading", lambda y: y + math.radians(25))  # no noise, but mounted otherwise
+    assert not off["heading_used"].any()
+
+
+def test_a_wheel_that_reads_zero_below_some_speed_is_no_proof_of_a_standstill(segments):
+    """Nor is it used where the car is faster than that."""
+    kind = SENSORS["speed"]
+    states = ErrorStates("scale", structure=True, others=tuple(kind.parameters))
+    source = kind(IMU, Tuning(), states)
+    at = {n: torch.zeros(3).double() for n in kind.parameters}
+    prediction = Predicted(1e-4 * torch.eye(states.count).double().expand(3, -1, -1), parameters=at)
+    said = {"speed": torch.tensor([[0.0, 0.0, 0.5, 0.5, 8.0]] * 3).double()}
+
+    def reads_zero(speed: float, memory):
+        v_n = speed * segments.start.C_nb[..., 0]
+        start = segments.start._replace(v_n=v_n)
+        rest = replace(segments, imu=segments.imu * 0 + still_samples(start).unsqueeze(1).unsqueeze(1))
+        (row, after) = source.rows(_epoch(rest, start, ImuError(torch.zeros(3, 6).double()), said), memory, prediction)
+        return row, after
+
+    fresh = source.begin(segments)
+    row, after = reads_zero(0.02, fresh)
+    assert row.used.all() and after.stopped.all() and (after.zone < 0.1).all()
+    row, creeping = reads_zero(0.9, fresh)
+    assert not row.used.any() and not creeping.stopped.any() and (creeping.zone > 0.7).all()
+    row, after = reads_zero(0.3, creeping)
+    assert row.used.all() and not after.stopped.any() and (row.R > 0.49).all()
+
+
+def still_samples(start):
+    """Specific force and rates (B, 6) of a car that does not accelerate."""
+    up = torch.tensor([0.0, 0.0, -9.81], dtype=torch.float64)
+    force = (start.C_nb.mT @ up.unsqueeze(-1)).squeeze(-1)
+    return torch.cat((force, torch.zeros_like(force)), -1)
+
+
 def test_a_heading_turns_with_the_frame(aided):
     """The same innovations in frames turned by other angles, the convergence of the meridians with them."""
     model = with_aids(build_filter("mbkf15_nhc", IMU), [STANDARD["heading"]])
@@ -171,7 +236,7 @@ def test_only_filters_that_know_a_car_take_what_a_drive_has():
     speed = [STANDARD["speed"]]
     assert with_aids(build_filter("mbkf15", IMU), speed) == build_filter("mbkf15", IMU)
     named = build_filter("mbkf15+speed", IMU)
-    assert [t.name for t in find_tables(named)] == ["speed"] and named.states.count == 18
+    assert [t.name for t in find_tables(named)] == ["speed"] and named.states.count == 19
     both = build_filter("mbkf21_nhc+speed", IMU)
     assert with_aids(both, speed) is both
     assert both == with_aids(build_filter("mbkf21_nhc", IMU), speed)

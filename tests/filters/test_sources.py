@@ -87,7 +87,7 @@ def test_a_name_is_taken_apart_and_put_together():
     assert prior.drop("prior") == "mbkf33_car+vibration_speed" == str(prior._replace(endings=("car",)))
     assert FilterName.parse("mbkf21_nhc+speed").add(["speed", "baro"]) == "mbkf21_nhc+speed+baro"
     assert FilterName.parse("mbkf21+speed").add(["baro"]) == "mbkf21+speed"  # knows no car
-    with pytest.raises(InputError, match="imu=auto finds the noise of a Kalman filter"):
+    with pytest.raises(InputError, match="imu=auto estimates the noise of Kalman filters"):
         check_finds_noise("mbkf15_prior+speed")
 
 

@@ -117,7 +117,7 @@ def test_the_example_says_what_it_does_not_understand(exported, example, tables,
         ([], ["imu,1" + ",2" * 2000, "imu,1,2,3"], "2 lines ignored"),
         ([], [f"imu,{10 * k},0,0,-9.8,0,0,0" for k in range(60)], "a gap: are the stamps in seconds?"),
         ([], [f"imu,{k / 50},0,0,-1,0,0,0" for k in range(60)], "az is -1.00 m/s2 in the mean, must be near -9.8"),
-        ([], lines[:60], "navigate: nothing solved, waiting for fixes over three seconds"),
+        ([], lines[:60], "navigate: nothing solved, waiting for fixes over 3 seconds"),
         ([], [], "navigate: nothing solved, waiting for samples of the IMU"),
     ):
         given = {"input": "".join(f"{line}\n" for line in log), "env": {"LD_LIBRARY_PATH": str(exported[0])}}

@@ -4,6 +4,10 @@ With f = C_nb e₁, the heading is ψ = atan2(f_E, f_N), and C = exp([δh×]) Ĉ
 
     δψ = δh_D − f_D (f_N δh_N + f_E δh_E) / (f_N² + f_E²)
 
+Its noise may be larger than stated. Successive innovations z show how large, whatever else is wrong for longer: ln w of
+the factor w ≥ 1 on its variance R is a running median, which outliers hardly move. It goes up by ``STEP`` / 2 over the
+number of measurements where (zₖ − zₖ₋₁)² is above the median 2 · 0.455 w R, else down, to a 1σ of ``MOST_STD`` at most.
+
 The tangent frame's North differs from North at the car by the convergence of the meridians, e tan φ / R, with e the
 way East. Both are written with the Earth's axis in n, (cos φ, 0, −sin φ) or the same turned about down
 (:func:`dlkf.data.augmentation.turn_frames`): a measured heading is the angle from the first axis of n.
@@ -27,6 +31,9 @@ from dlkf.filters.sources import Measurement, Parameter, Predicted, SensorSource
 
 DEFAULT_STD, LEAST_STD = math.radians(0.5), math.radians(0.1)
 KNOWS = math.radians(5.0)  # 1σ: a filter whose heading is better than this can detect a wrong one
+FIRST, MEMORY = 10.0, 300.0  # measurements that the stated 1σ counts for, and over which w forgets
+STEP, MEDIAN = 20.0, 0.4549  # of ln w, over the number of measurements; of χ² of one component
+MOST_STD = math.radians(4.0)  # which noise may reach; an error beyond is one of mounting
 
 
 class HeadingMemory(NamedTuple):
@@ -34,6 +41,9 @@ class HeadingMemory(NamedTuple):
 
     factor: Tensor  # (1,) on its 1σ, the same for all drives
     trust: Trust
+    variance: Tensor  # (B,) w, factor on the variance of its noise
+    counted: Tensor  # (B,) measurements that it is of
+    last: Tensor  # (B,) z, NaN where the last update interval had none
 
 
 class DualAntennaHeading(SensorSource):
@@ -44,7 +54,9 @@ class DualAntennaHeading(SensorSource):
 
     def begin(self, batch: Batch) -> HeadingMemory:
         """Memory before the first measurement."""
-        return HeadingMemory(batch.imu.new_tensor([self.tuning.heading_std]), Trust.begin(batch.imu, batch.size[0]))
+        B, one = batch.size[0], batch.imu.new_ones(batch.size[0])
+        factor = batch.imu.new_tensor([self.tuning.heading_std])
+        return HeadingMemory(factor, Trust.begin(batch.imu, B), one, FIRST * one, torch.nan * one)
 
     def rows(
         self, epoch: Epoch, memory: HeadingMemory, prediction: Predicted
@@ -68,8 +80,18 @@ class DualAntennaHeading(SensorSource):
         tilt = -down / level.clamp_min(1e-3)
         H[:, 0, self.states.attitude] = torch.stack((tilt * north, tilt * east, torch.ones_like(tilt)), -1)
         H[:, 0, self.states.of("heading_offset")] = 1.0
-        R = (memory.factor * torch.where(std > 0, std.clamp_min(LEAST_STD), DEFAULT_STD)).square()
+        stated = (memory.factor * torch.where(std > 0, std.clamp_min(LEAST_STD), DEFAULT_STD)).square()
+        R = stated * memory.variance
         unsure = predicted_variance(prediction.P, H)[:, 0]
         trust, used, excess = judge(memory.trust, seen, z, unsure + R, unsure < KNOWS**2, level > 0.5)
-        rows = Measurement(z.unsqueeze(-1), H, (R * excess).unsqueeze(-1), used.unsqueeze(-1))
-        return rows, memory._replace(trust=trust)
+        change = z - memory.last
+        change = torch.atan2(torch.sin(change), torch.cos(change))
+        counts = seen & (level > 0.5) & ~memory.last.isnan()
+        counted = (memory.counted + 1).clamp_max(MEMORY)
+        step = torch.where(change.square() > 2 * MEDIAN * R, 0.5 * STEP, -0.5 * STEP)
+        variance = torch.minimum(memory.variance * torch.exp(step / counted), MOST_STD**2 / stated).clamp_min(1.0)
+        memory = HeadingMemory(
+            memory.factor, trust, torch.where(counts, variance, memory.variance),
+            torch.where(counts, counted, memory.counted), torch.where(seen, z, torch.nan),
+        )  # fmt: skip
+        return Measurement(z.unsqueeze(-1), H, (R * excess).unsqueeze(-1), used.unsqueeze(-1)), memory

@@ -1,8 +1,10 @@
-"""Wheel speed, with scale factor, delay and the wheel's place to the right of the IMU as states.
+"""Wheel speed, with scale factor, offset, delay and the wheel's place to the right of the IMU as states.
 
 A wheel at y to the right of the IMU that runs at scale 1 + s and comes d seconds late reads at the time t
 
-    m(t) = (1 + s) (v_x(t − d) − y ω_z(t − d))          v_x = (C_bn v_n)_x
+    m(t) = (1 + s) (v_x(t − d) − y ω_z(t − d)) ± o          v_x = (C_bn v_n)_x
+
+with an offset o away from zero, of a displayed speed or of km/h that are cut off, wherever it does not read zero,
 
 and its samples of an update interval make one measurement, compared with the mean of the prediction over their
 stretch. The error states refer to the interval's end, L seconds after the middle of the stretch:
@@ -11,10 +13,11 @@ stretch. The error states refer to the interval's end, L seconds after the middl
 R holds white noise, slip in proportion to speed and acceleration (tyre stiffness; Gillespie 1992), and is larger, but
 not for the gate, for a value that repeats itself, whose error is the same each time. Whole km/h are intervals
 (:mod:`dlkf.filters.aids.rounding`). The gate allows for a drift of the filter's own speed that its covariance does not
-cover, which is no fault of a wheel. A reading of zero counts only where the car is nearly at rest already or shakes no
-more than in its calmest second of motion: a sensor that is dead or a wheel that is locked does not stop the car. Any
-other value is that of a dead sensor, too, if it stays the same while the speed of the INS changes. A sensor without a
-sign is read with the sign of the filter's own speed.
+cover, which is no fault of a wheel. A reading of zero counts only where the car is nearly at rest already: a dead
+sensor or a locked wheel does not stop the car. Many sensors read zero below some speed; the largest at which a
+good prediction has seen that is the least 1σ of a zero, which is then no proof of a standstill. Any other value is that
+of a dead sensor, too, if it stays the same while the speed of the INS changes. A sensor without a sign is read with the
+sign of the filter's own speed.
 """
 
 from __future__ import annotations
@@ -34,7 +37,7 @@ from dlkf.filters.aids.stretch import mean_force, stack_limits, stretch_weights,
 from dlkf.filters.aids.trust import Trust, judge
 from dlkf.filters.integration import Epoch
 from dlkf.filters.sources import Measurement, Parameter, Predicted, SensorSource, aid_of, predicted_variance
-from dlkf.filters.stationarity import LastSecond, acceleration_std
+from dlkf.filters.stationarity import acceleration_std
 
 LEAST_STD = 0.03  # m/s: the least 1σ, whatever a file gives
 KMH = 1 / 3.6
@@ -46,11 +49,12 @@ SLOPE_S = 0.1  # an acceleration is taken over twice so long
 ROLLING, BACKWARDS = 1.0, -0.3  # m/s: a wheel that turns; one with a sign
 ZERO, ZERO_STD = 0.05, 0.1  # m/s: a wheel at rest, and how slowly it may turn then
 NEARLY_AT_REST = 0.5  # m/s: so slow a car may be stopped by its wheel alone
+DEAD_ZONE, RESOLVED = 2.0, 0.2  # m/s: the most that sensors read as zero, and what a standstill is told from
+SEES_ZONE = 0.15  # m/s 1σ of a prediction that shows it
 KNOWS = 0.5  # m/s 1σ: a filter whose speed is better than this can detect a wrong wheel
 DRIFT = 0.2  # m/s² of an IMU that its filter's covariance does not cover: beyond the gate, but no fault of the wheel
 # m/s, beyond 2σ of the accelerations: by so much the speed may change within some seconds while a wheel's does not
 DEAD, DEAD_S = 1.0, 10.0
-MEMORY_S = 100.0  # s in which the calmest second of motion grows by e
 
 
 class WheelMemory(NamedTuple):
@@ -63,10 +67,9 @@ class WheelMemory(NamedTuple):
     gained: Tensor  # (B,) m/s of the INS in the last seconds since it came first
     whole: Tensor  # (B,) share of the values that were whole km/h
     signed: Tensor  # (B,) bool: it has been negative
-    calmest: Tensor  # (B,) least vibration level of a second in motion, m/s² rad/s
+    zone: Tensor  # (B,) m/s, the largest speed at which it has read zero
     rolling: Tensor  # (B,) bool: it turned in the last interval, and counted
     stopped: Tensor  # (B,) bool: it did not turn in the last interval, and counted
-    second: LastSecond
 
 
 class WheelSpeed(SensorSource):
@@ -77,6 +80,7 @@ class WheelSpeed(SensorSource):
         "wheel_scale": Parameter(std=0.05, walk=5e-5),
         "wheel_delay_s": Parameter(std=0.1, walk=1e-4, start=0.05),
         "wheel_right_m": Parameter(std=0.5, walk=1e-4),
+        "wheel_offset": Parameter(std=0.15, walk=1e-5),
     }
 
     def begin(self, batch: Batch) -> WheelMemory:
@@ -84,21 +88,23 @@ class WheelSpeed(SensorSource):
         B, zeros = batch.size[0], batch.imu.new_zeros(batch.size[0])
         std = batch.imu.new_tensor([self.tuning.wheel_std])
         trust = Trust.begin(batch.imu, B)
-        no, unknown = zeros > 0, torch.full_like(zeros, math.inf)
-        return WheelMemory(std, trust, zeros, zeros, zeros, zeros, no, unknown, no, no, LastSecond.begin(batch))
+        no = zeros > 0
+        return WheelMemory(std, trust, zeros, zeros, zeros, zeros, no, zeros, no, no)
 
     def rows(self, epoch: Epoch, memory: WheelMemory, prediction: Predicted) -> tuple[Measurement | None, WheelMemory]:
         """The row, and what the wheel has earned by it."""
         said = aid_of(epoch, self.table.name)
         if said is None:
             return None, memory
-        second, (level, *_) = memory.second.update(epoch.corrected, epoch.dt)
-        shaking = torch.zeros_like(memory.calmest) if level is None else level
         value, std, lag, span, count = said.unbind(-1)
         seen = count > 0
         scale = 1.0 + prediction.parameters["wheel_scale"]
         speed, H, accel = self._predict_speed(epoch, prediction, lag, span, scale)
-        expected, unsure = scale * speed, predicted_variance(prediction.P, H)[:, 0]
+        zero = value.abs() < ZERO
+        way = torch.where(zero, 0.0, torch.where(speed < 0, -1.0, 1.0))
+        H[:, :, self.states.of("wheel_offset")] = way[:, None, None]
+        expected = scale * speed + way * prediction.parameters["wheel_offset"]
+        unsure = predicted_variance(prediction.P, H)[:, 0]
         reverse = ~memory.signed & (value > 0) & (expected < -2 * unsure.clamp_min(0).sqrt())
         value = torch.where(reverse, -value, value)
         z = value - expected
@@ -111,15 +117,17 @@ class WheelSpeed(SensorSource):
         fits = ((in_kmh - (in_kmh + 0.5).floor()).abs() < 1e-3).to(value.dtype)
         turns = seen & (value.abs() > ROLLING)
         whole = torch.where(turns, torch.lerp(memory.whole, fits, 0.1), memory.whole)
-        zero = value.abs() < ZERO
         noise = torch.where(std > 0, std.clamp_min(LEAST_STD), memory.std)
-        noise = torch.where(zero, noise.clamp_min(ZERO_STD), noise)
+        hidden = expected.abs() - 2 * unsure.clamp_min(0).sqrt()
+        shown = seen & zero & (unsure < SEES_ZONE**2) & (hidden < DEAD_ZONE)
+        zone = torch.where(shown, torch.maximum(memory.zone, hidden), memory.zone)
+        noise = torch.where(zero, torch.maximum(noise.clamp_min(ZERO_STD), zone), noise)
         rounded = (whole > 0.5) & ~zero
         noise = torch.where(rounded, (memory.std.square() + (JITTER_S * accel).square()).sqrt(), noise)
         slip = (SLIP * speed * accel).square()
         gate = noise.square() + slip
         R = torch.where(zero | rounded, gate, (noise * (1 + repeats.clamp_max(REPEATS))).square() + slip)
-        plausible = torch.where(zero, (z.abs() < NEARLY_AT_REST) | (shaking <= memory.calmest), ~dead)
+        plausible = torch.where(zero, z.abs() < NEARLY_AT_REST, ~dead)
         beyond = torch.where(rounded, (z.abs() - 0.5 * KMH).clamp_min(0.0), z)
         drifted = (DRIFT * epoch.dt * epoch.imu.shape[1]) ** 2
         trust, used, excess = judge(memory.trust, seen, beyond, unsure + gate + drifted, unsure < KNOWS**2, plausible)
@@ -127,12 +135,10 @@ class WheelSpeed(SensorSource):
         of_cell = rounded_measurement(z, 0.5 * KMH, unsure, R)
         again = torch.where(z.abs() < 0.5 * KMH, (1 + repeats).square(), 1.0)
         z, R = torch.where(rounded, of_cell[0], z), torch.where(rounded, of_cell[1] * again, R)
-        moving = used & turns & (unsure < KNOWS**2)
-        calmest = memory.calmest * math.exp(epoch.span_s / MEMORY_S)
         memory = WheelMemory(
             memory.std, trust, torch.where(seen, value, memory.last), repeats, gained, whole,
             memory.signed | (used & ~reverse & (value < BACKWARDS)),
-            torch.where(moving, torch.minimum(calmest, shaking), calmest), used & turns, used & zero, second,
+            zone, used & turns, used & zero & (zone < RESOLVED),
         )  # fmt: skip
         return Measurement(z.unsqueeze(-1), H, R.unsqueeze(-1), used.unsqueeze(-1)), memory
 
