@@ -104,6 +104,14 @@ def test_evaluate_withholds_what_was_asked_for(drive):
     assert report.headline in report._repr_html_() and "end_rms_m" in repr(report)
 
 
+def test_a_sensor_that_a_filter_refuses_is_a_warning(drive):
+    """A dual-antenna receiver mounted otherwise, by less than the checks of its table see."""
+    reference = drive["reference"].iloc[::10]
+    heading = pd.DataFrame({"t": reference["t"], "heading": reference["yaw"] + np.radians(24)})
+    with pytest.warns(UserWarning, match=r"heading in \d+ of \d+ updates, most of them refused: see its unit, sign"):
+        dlkf.navigate(drive["imu"], drive["gnss"], model="mbkf21_nhc", heading=heading)
+
+
 def test_further_sensors_are_taken(drive):
     """By a filter that knows a car; another one leaves them."""
     fixes = drive["gnss"]

@@ -77,18 +77,23 @@ BAD = {
     "backwards": (_speed(lambda v: -v), "negative where the car drives forward; negate it"),
     "unknown": (_speed(lambda v: np.nan * v), "speed is NaN in every row.*aids="),
     "infinite": (_speed(lambda v: np.where(np.arange(len(v)) == 7, np.inf, v)), "row 7: speed is inf"),
-    "behind": (_late(1.5), r"1.6\d? s behind that of GNSS; subtract 1.6\d? s from its t"),
-    "ahead": (_late(-2.15), r"2.0\d? s ahead of that of GNSS; add 2.0\d? s"),
+    "ahead": (_late(1.5), r"1.6\d? s ahead of that of GNSS; subtract 1.6\d? s from its t"),
+    "behind": (_late(-2.15), r"2.0\d? s behind that of GNSS; add 2.0\d? s"),
     "elsewhere": (_late(1e6), "outside the IMU's"),
     "milliseconds": (_rows("speed", lambda f: f.assign(t=1e-3 * f["t"])), "t is not in seconds"),
     "backwards in time": (_rows("speed", lambda f: f.iloc[::-1]), "row 1: t goes back"),
     "no rows": (_rows("speed", lambda f: f.iloc[:0]), "has no rows; remove the table"),
     "negative std": (_rows("speed", lambda f: f.assign(std=-1.0)), "row 0: std is -1.0"),
     "degrees": (_heading(np.degrees), "looks like degrees"),
-    "from East": (_heading(lambda x: np.pi / 2 - x), "counts from East"),
+    "infinite std": (_rows("speed", lambda f: f.assign(std=np.inf)), "row 0: std is inf; must be finite"),
+    "from East": (_heading(lambda x: np.pi / 2 - x), "counts from East; use π/2 − heading"),
+    "anticlockwise": (_heading(lambda x: -x), "counts anticlockwise; negate it"),
     "across": (_heading(lambda x: x + np.pi / 2), r"\+90° off the course"),
     "hPa": (_rows("baro", lambda f: f.assign(pressure=f["pressure"] / 100)), "must be in Pa: looks like hPa"),
-    "neither": (_rows("baro", lambda f: f[["t"]]), "has neither of pressure, height_m"),
+    "neither": (
+        _rows("baro", lambda f: f[["t"]]),
+        "neither of pressure, height_m; one of them is needed, it has t",
+    ),
 }
 
 

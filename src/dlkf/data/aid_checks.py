@@ -38,13 +38,15 @@ def check_aid(name: str, table: Columns, imu: Columns, moved: Motion, where: str
     t = table["t"]
     values = [c for c in table if c not in ("t", "std")]
     if not values:
-        raise InputError(f"{where}: has neither of {', '.join(OPTIONAL[name].names[:-1])}; one of them is needed")
+        wanted, has = OPTIONAL[name].names[:-1], ", ".join(table)
+        raise InputError(f"{where}: has neither of {', '.join(wanted)}; one of them is needed, it has {has}")
     if len(t) > 1 and not RATES_HZ[0] <= (rate := 1 / float(np.median(np.diff(t)))) <= RATES_HZ[1]:
         raise InputError(f"{where}: {rate:.3g} rows a second: t is not in seconds; give t in seconds")
     refuse_rows(table, values, np.isinf, where, "write NaN where unknown")
     if not np.any([np.isfinite(table[c]) for c in values]):
         raise InputError(f"{where}: {' and '.join(values)} is NaN in every row; {_leaving_out(name)}")
-    refuse_rows(table, table.keys() & {"std"}, lambda x: x < 0, where, "must be ≥ 0, or NaN if unknown")
+    of_std = table.keys() & {"std"}
+    refuse_rows(table, of_std, lambda x: (x < 0) | np.isinf(x), where, "must be finite and ≥ 0, or NaN if unknown")
     if not ((t > imu["t"][0]) & (t <= imu["t"][-1] + 1)).any():
         raise InputError(
             f"{where}: t from {t[0]:.3f} to {t[-1]:.3f} lies outside the IMU's {imu['t'][0]:.3f} to "
@@ -78,7 +80,7 @@ def _check_speed(table: Columns, moved: Motion, where: str) -> None:
     lag_s = _lag(t, v, at, ground)
     if abs(lag_s) > APART_S:
         raise InputError(
-            f"{where}: the clock of the speed is {abs(lag_s):.1f} s {'behind' if lag_s > 0 else 'ahead of'} that of "
+            f"{where}: the clock of the speed is {abs(lag_s):.1f} s {'ahead of' if lag_s > 0 else 'behind'} that of "
             f"GNSS; {'subtract' if lag_s > 0 else 'add'} {abs(lag_s):.2f} s {'from' if lag_s > 0 else 'to'} its t"
         )
     ratio = float(np.median(np.interp(at + lag_s, t, v)[fast] / ground[fast]))
@@ -116,10 +118,11 @@ def _check_heading(table: Columns, moved: Motion, where: str) -> None:
         return
     course = np.interp(at, moved.t, np.unwrap(moved.course))[fast]
     seen = heading[np.clip(np.searchsorted(t, at[fast]), 0, len(t) - 1)]
-    off, mirrored = (_middle(angle - course) for angle in (seen, np.pi / 2 - seen))
-    counts_from_east = mirrored[1] < 0.5 * off[1] and abs(mirrored[0]) < 0.1
-    if counts_from_east and max(abs(off[0]), off[1]) > np.radians(SQUARE_DEG):
-        raise InputError(f"{where}: heading counts from East, must count clockwise from North; use π/2 − heading")
+    off = _middle(seen - course)
+    for angle, said in ((np.pi / 2 - seen, "from East; use π/2 − heading"), (-seen, "anticlockwise; negate it")):
+        mirrored = _middle(angle - course)
+        if mirrored[1] < 0.5 * off[1] and abs(mirrored[0]) < 0.1 and max(abs(off[0]), off[1]) > np.radians(SQUARE_DEG):
+            raise InputError(f"{where}: heading must count clockwise from North, it counts {said}")
     if abs(off[0]) > np.radians(SQUARE_DEG):
         raise InputError(
             f"{where}: heading is {np.degrees(off[0]):+.0f}° off the course in the median; subtract the angle of the "

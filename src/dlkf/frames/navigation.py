@@ -127,7 +127,8 @@ def navigate(
         drives = load_dataset(folder, dtype=torch.float64, reference=False, aids=find_tables(estimator), **grid)
         (navigated,) = navigate_drives(drives, estimator, align=read_align())
     solution = Solution.of(navigated, fixes, short_name(model), REMEDY if takes_tuning(model) else OF_NETWORK)
-    for line in (*unused, *slow, *([solution.warning] if solution.warning else [])):
+    unfit = [navigated.sensors()[name] for name in navigated.unfit_sensors]
+    for line in (*unused, *slow, *unfit, *([solution.warning] if solution.warning else [])):
         warnings.warn(line, UserWarning, stacklevel=count_calls())
     return solution
 

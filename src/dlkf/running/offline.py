@@ -45,6 +45,7 @@ SAMPLES_AT_ONCE = CHUNK_SAMPLES  # IMU samples of drives in memory, 8 h at 50 Hz
 LONG_RESTART_S = 10.0  # without rows, before the next is named
 VIBRATION = "vibration_speed"
 MOSTLY = 0.5  # of the updates of a further sensor; where fewer are used, its numbers are likely wrong
+REFUSED = "most of them refused: see its unit, sign and clock"
 
 
 @dataclass(frozen=True)
@@ -166,6 +167,12 @@ class Navigated:
             found[name] = int(table[f"{name}_used"].sum()), int((~np.isnan(ratio)).sum()), rms(ratio)
         return found
 
+    @property
+    def unfit_sensors(self) -> tuple[str, ...]:
+        """Further sensors of which most measurements were refused; vibration has neither unit nor clock."""
+        updates = self.sensor_updates.items()
+        return tuple(name for name, (used, seen, _) in updates if used < MOSTLY * seen and name != VIBRATION)
+
     def sensors(self) -> dict[str, str]:
         """Of further sensors: how many updates used them, how they fit, and what was found of them at the end."""
         said, table = {}, self.table
@@ -174,8 +181,7 @@ class Navigated:
                 if name != VIBRATION:  # which needs none while there is GNSS
                     said[name] = f"{name}: no update"
                 continue
-            wrong = used < MOSTLY * seen and name != VIBRATION  # which has neither unit nor clock
-            refused = ", most of them refused: see its unit, sign and clock" if wrong else ""
+            refused = f", {REFUSED}" if name in self.unfit_sensors else ""
             said[name] = f"{name} in {used} of {seen} updates{refused} (normalised innovation RMS {spread:.2g})"
         for std in (column for column in self.sensor_columns if column.startswith("std_")):
             name, last = std.removeprefix("std_"), table.iloc[-1]
