@@ -23,7 +23,7 @@ import numpy as np
 import torch
 from pipelines.studies.ablations.plus_parts import parts
 from pipelines.studies.aids import ratio
-from pipelines.studies.logs import LOGS, G
+from pipelines.studies.cars.logs import LOGS, G
 from pipelines.studies.plus import SOURCES, Row, constants, found_noise, load, real_cases, score
 
 from dlkf.base.errors import InputError

@@ -33,7 +33,12 @@ def test_a_row_for_each_filter_and_sensor():
     assert table is not None and len(table.rows) == 1
     name, sensor, updates, used, spread, scale, *_ = table.rows[0]
     assert (name, sensor, updates, used) == ("aided", "speed", "50", "80.0") and 0.05 < float(spread) < 1.5
-    assert table.columns[5:] == ["Wheel scale error\n[%]", "Wheel delay\n[ms]", "Wheel right of IMU\n[m]"]
+    assert table.columns[5:] == [
+        "Wheel scale error\n[%]",
+        "Wheel delay\n[ms]",
+        "Wheel right of IMU\n[m]",
+        "Wheel offset\n[m/s]",
+    ]
     last = scores.filters["aided"].aids[:, -1, columns["aided"].index("wheel_scale")]
     assert abs(float(scale.split()[0]) - 100 * last.mean()) < 0.1
     assert sensor_table(score({"plain": plain}, [batch]), columns) is None
@@ -48,8 +53,8 @@ def test_speed_from_vibration_has_a_row_of_its_own_beside_a_wheel_sensor():
     table = sensor_table(score({"both": model}, [batch]), {"both": aid_columns(model)})
     assert table is not None
     speed, vibration = table.rows
-    assert speed[1] == "speed" and all(" ± " in cell for cell in speed[5:]) and len(speed) == 8
-    assert vibration[:2] == ["both", "vibration speed"] and vibration[5:] == ["–"] * 3  # this car does not shake
+    assert speed[1] == "speed" and all(" ± " in cell for cell in speed[5:]) and len(speed) == 9
+    assert vibration[:2] == ["both", "vibration speed"] and vibration[5:] == ["–"] * 4  # this car does not shake
 
 
 @pytest.mark.parametrize(

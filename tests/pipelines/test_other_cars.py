@@ -12,8 +12,8 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
-from pipelines.studies import logs as car_logs
 from pipelines.studies import other_cars
+from pipelines.studies.cars import logs as car_logs
 from scipy.io import savemat
 
 from dlkf.base.errors import InputError

@@ -95,7 +95,7 @@ def choose_epoch(spacings: Iterable[UsableFixes], rate_hz: float, estimator: Fil
     one a second. Of slow receivers that spacing in whole seconds.
     """
     closest = min((s.usual_s for s in spacings), default=1.0)
-    if SLOWEST_FIXES_S < closest <= SLOWEST_START_S:
+    if SLOWEST_FIXES_S <= closest <= SLOWEST_START_S:
         return float(math.ceil(closest - SLACK_S))
     samples = closest * rate_hz if math.isfinite(closest) else 0.0  # no drive has two fixes: any grid will do
     whole = samples >= 1 and abs(samples - round(samples)) < 1e-6
