@@ -50,6 +50,7 @@ MOTION_SIGMAS = 2.0  # of a velocity: less is no motion
 CONFIRMED_S = 1.0  # that a motion has been one
 REACH_S = FIT_S  # that a velocity may be older than the one it is compared with
 CHANGE_SIGMAS, MOST_ACCELERATION = 3.0, 3.0  # σ and m/s² · time that two velocities of a receiver may differ by
+NEEDED = f"velocities at most {REACH_S:g} s or positions at most {FIT_S / 2:g} s apart"  # for a start, in a message
 READ_S = FIT_S + 2 * CONFIRMED_S  # before a boundary
 JOLT_STD = 0.3  # m/s, that second differences of a car's velocity are taken for
 LEAST_DIFFERENCES = 3  # that show a scatter

@@ -48,7 +48,7 @@ from dlkf.data.alignment import SEARCH, AlignConfig
 from dlkf.data.limits import FROZEN_SPEED_M_S
 from dlkf.data.resampling import ON_BOUNDARY_S, find_boundary, make_fixes
 from dlkf.data.validate import LIMITS, Limits
-from dlkf.data.velocity_fit import FIT_S, REACH_S
+from dlkf.data.velocity_fit import NEEDED
 from dlkf.filters.aids.attach import find_tables
 from dlkf.filters.card import warn_slow_drives
 from dlkf.filters.smoother import Filter, SmoothedSolution
@@ -65,7 +65,7 @@ ANCHOR_M = 50_000.0  # from its origin, beyond which the tangent frame moves
 SETTLE_S = 3.0  # fixes over so long lay the grid
 MOST_EARLY_SAMPLES = 10_000  # of further sensors
 FIXES_OVER = f"fixes over {SETTLE_S:.0f} seconds"
-MOTION = f"the car to move under GNSS, with velocities at most {REACH_S:g} s or positions at most {FIT_S / 2:g} s apart"
+MOTION = f"the car to move under GNSS, with {NEEDED}"
 FIRST_OF_FIXES, FIRST_OF_AIDS = 0, 1  # boundaries at which they can count
 
 

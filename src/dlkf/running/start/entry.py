@@ -36,7 +36,7 @@ from dlkf.data.alignment import (
 )
 from dlkf.data.drive import Batch, Drive
 from dlkf.data.segments import whole_drives
-from dlkf.data.velocity_fit import FIT_S, JOLT_STD, REACH_S, scale_std
+from dlkf.data.velocity_fit import JOLT_STD, NEEDED, scale_std
 from dlkf.navigation.attitude import vector_from_rotation
 from dlkf.navigation.earth import EARTH_RATE, STANDARD_GRAVITY, ned_axes
 from dlkf.navigation.error_model import RATE_AVERAGE_S
@@ -227,8 +227,7 @@ def _first_motion(drive: Drive, config: AlignConfig, earliest: int) -> FirstMoti
         apart = torch.nonzero(drive.gnss_valid[:, :3].all(-1)).flatten().diff().double() * drive.epoch_s
         if len(apart) and (gap := float(apart.median())) > SLOWEST_FIXES_S * max(drive.epoch_s, 1.0):
             mend = f"set epoch_s={math.ceil(gap - SLACK_S)}" if gap <= SLOWEST_START_S else "leave the drive out"
-            need = f"velocities at most {REACH_S:g} s or positions at most {FIT_S / 2:g} s apart"
-            raise InputError(f"drive {drive.name}: fixes are {gap:g} s apart, a start needs {need}; {mend}")
+            raise InputError(f"drive {drive.name}: fixes are {gap:g} s apart, a start needs {NEEDED}; {mend}")
         raise InputError(
             f"drive {drive.name}: never moves faster than {config.min_speed:g} m/s for {config.window_s:g} s "
             "with GNSS, so yaw is unknown; lower align.min_speed or leave the drive out"
