@@ -16,12 +16,16 @@ from dlkf.filters.integration import integrate
 from dlkf.filters.stationarity import (
     APART,
     CHANGED_ACCEL,
+    CHANGING_ACCEL,
+    LEAST_FORCE,
+    LEAST_RATE,
     MEMORY_S,
     REST_S,
     LastSecond,
     Rest,
     VibrationLevel,
     acceleration_std,
+    detect_stationary,
 )
 from dlkf.filters.tuning import Tuning
 from dlkf.navigation.attitude import rotation_from_rpy, rotation_from_vector
@@ -107,6 +111,58 @@ def test_a_car_that_pulls_away_in_an_outage_is_not_held_by_its_standstill(name):
     batch = replace(batch, start_std=torch.full_like(batch.start_std, 0.03))
     taken = found(batch, name, accel_noise=30.0, accel_walk=100.0)
     assert taken[:, 25:29].all() and not taken[:, 30:33].any()
+
+
+@pytest.mark.parametrize("last_force", [-1.3, -0.7])
+def test_a_rolling_stop_is_no_standstill(last_force):
+    """A car brakes at 0.7 m/s² from 0.75 to 0.05 m/s, as calm as at rest, and errors of tilt may explain that: a
+    standstill if the force was the same a second before, none if the car braked harder."""
+    seen = []
+
+    class Seen(CarConstraints):
+        def detect_rest(self, epoch, turning, prediction, memory):
+            seen.append((epoch, prediction.P, memory.prior))
+            return super().detect_rest(epoch, turning, prediction, memory)
+
+    kalman = build_filter("mbkf15_nhc", IMU)
+    integrate(scene(1, 1), replace(kalman, sources=tuple(Seen(s.tuning, s.states) for s in kalman.sources)))
+    epoch, P, prior = seen[0]
+    P = P.clone()
+    P[:, ATTITUDE, ATTITUDE] = 0.06**2 * torch.eye(3, dtype=D)
+    along, level = torch.tensor([[1.0, 0.0, 0.0]], dtype=D), torch.eye(3, dtype=D)[None]
+    start, end = (NavState(0 * along, v * along, level) for v in (0.75, 0.05))
+    force = torch.tensor([-0.7, 0.0, -9.8, 0.0, 0.0, 0.0], dtype=D)
+    noise = 1e-3 * torch.randn(1, M, 6, generator=torch.Generator().manual_seed(1), dtype=D)
+    epoch = epoch._replace(
+        corrected=force + noise, error=epoch.error._replace(bias=0 * epoch.imu_error), start=start,
+        window=epoch.window._replace(end=end), fix=epoch.fix._replace(used=epoch.used & False),
+    )  # fmt: skip
+    before = VibrationLevel.begin(scene(1, 1))._replace(moving=torch.tensor([0.1], dtype=D))
+    before = before._replace(rest=before.rest._replace(last_force=torch.tensor([[last_force, 0.0]], dtype=D)))
+    stationary, *_ = detect_stationary(epoch, 0 * along, P, before, prior)
+    assert stationary.item() == (last_force == -0.7)
+
+
+def test_a_force_that_changes_within_a_second_is_an_acceleration():
+    rest = Rest.begin(torch.zeros(1, dtype=D), 2)
+    at_rest, off = torch.tensor([[0.1, 0.0], [0.0, -0.1]], dtype=D), torch.tensor([1.2 * CHANGING_ACCEL, 0.0], dtype=D)
+    assert not rest.is_changing(at_rest).any()  # nothing known
+    rest = rest.update(at_rest, torch.tensor([True, False]), 1.0)
+    assert rest.is_changing(at_rest + off).all() and not rest.is_changing(at_rest + 0.5 * off).any()
+
+
+def test_sensors_that_round_find_the_same_standstills():
+    """Gyroscopes that read the same in every sample at rest: their spread is 0 there, or what rounding leaves of it."""
+    batch = shaken((0.05, 0.0), (0.2, 8e-3), SWAY)
+    batch = outage(replace(batch, available=torch.ones_like(batch.available)), 60, 100)
+    rest = (batch.truth.v_n.norm(dim=-1) < 0.01)[..., None, None]
+    imu = batch.imu.clone()
+    imu[..., 3:] = torch.where(rest, batch.true_imu_error[..., None, 3:], imu[..., 3:])
+    noise = 1e-15 * torch.randn(imu.shape, generator=torch.Generator().manual_seed(3), dtype=D)
+    noise[:, ::2] = 0.0
+    taken = found(beside(replace(batch, imu=imu), replace(batch, imu=imu + rest * noise)), "mbkf21_car")
+    assert taken.chunk(2)[0].equal(taken.chunk(2)[1])
+    assert taken[:, 60:].float().mean() > 0.9
 
 
 def test_the_force_of_a_standstill_is_known_during_it_and_for_seconds_after():
@@ -215,7 +271,8 @@ def test_the_level_is_that_of_a_second_whatever_the_update_interval():
     batch = scene(2, 3, seed=5)
     boxes = batch.imu.numpy().reshape(2, 3, 10, M // 10, 6).mean(3)
     variance = boxes.var(2, ddof=1)
-    expected = (variance[..., :3].sum(-1) * variance[..., 3:].sum(-1)) ** 0.5
+    force, rate = variance[..., :3].sum(-1), variance[..., 3:].sum(-1)
+    expected = ((force + LEAST_FORCE**2) * (rate + LEAST_RATE**2)) ** 0.5
     for per_second in (1, 5, 10, 50):
         cut = in_parts(batch, per_second) if per_second > 1 else batch
         second, levels = LastSecond.begin(cut), []

@@ -39,6 +39,7 @@ SURE_STD = 0.3  # m/s: speeds with a larger 1σ do not update the levels
 CARRIER_STD = 0.2  # m: positions with a larger 1σ show no motion
 STANDING_SPEED, MOVING_SPEED = 0.3, 1.5  # m/s: from which side on a second counts as the one or the other
 APART = 10.0  # prior ratio of the level of a moving car to that of a stationary one
+LEAST_FORCE, LEAST_RATE = 1e-3, 1e-4  # m/s², rad/s: added to the spreads, which are 0 at rest where sensors round
 # ratios of moving to standing: below the first the samples do not separate the two, above the second they surely do
 DISTINCT, SURELY_DISTINCT = 2.0, 4.0
 MEMORY_S = 100.0  # s, stationary or moving, in which a level grows by e, so that a wrong second decays
@@ -56,6 +57,7 @@ SPAN_S, SPAN_LEFT_S = 5.0, 10.0  # s between two positions that show a mean spee
 SPAN_SIGMAS, SPAN_STANDING = 3.0, 0.3  # 1σ that a mean speed is beyond MOVING_SPEED; m/s, that of a standstill
 LONG_ACCEL = 0.2  # m/s², instead of STILL_ACCEL, of a long rest: a filter with a wrong speed has a wrong tilt
 LONG_S, LONG_SIGMAS, ALIKE = 10.0, 20.0, 2.0  # s, 1σ of the speed: of a standstill at most so many times its level
+CHANGING_ACCEL = 0.3  # m/s² from the force of the last second, from which on errors of tilt explain no acceleration
 CHANGED_ACCEL, REST_S = 0.08, 3.0  # m/s² from the force of a standstill; s over which it is known, and kept after it
 CREEPING_SPEED, CREEPING_SIGMAS = 0.05, 3.5  # of the mean velocity of fixes at a standstill: at most, m/s and 1σ
 MOST_FIXES, FIX_S = 10.0, 3.0  # in that mean; s after the last of them that it counts
@@ -165,7 +167,8 @@ class PositionSpan(NamedTuple):
 class Rest(NamedTuple):
     """What a standstill has to agree with: its own specific force so far, and the fixes' velocities."""
 
-    force: Tensor  # (B, 2) m/s² forward and right as measured, mean over the last standstill; NaN: none
+    last_force: Tensor  # (B, 2) m/s² forward and right as measured, mean over the last second; NaN: none
+    force: Tensor  # (B, 2) its mean over the last standstill; NaN: none
     left_s: Tensor  # (B,) s since it
     velocity: Tensor  # (B, 2) m/s, mean of fixes since the car shows no acceleration and no turn
     std: Tensor  # (B,) m/s, 1σ of the last of them
@@ -177,12 +180,16 @@ class Rest(NamedTuple):
         """Nothing known."""
         zero = like.new_zeros(batch_size)
         none = like.new_full((batch_size, 2), math.nan)
-        return cls(none, zero, torch.zeros_like(none), zero, zero, zero)
+        return cls(none, none.clone(), zero, torch.zeros_like(none), zero, zero, zero)
 
     def has_changed(self, force: Float[Tensor, "B 2"]) -> Bool[Tensor, " B"]:
-        """Whether the force differs from that of the standstill that has just been: the car pulls away. Errors of tilt
-        and accelerometers, which may look like any acceleration, do not change within seconds."""
+        """Whether the force differs from that of the standstill that has just been: the car pulls away."""
         return (force - self.force).norm(dim=-1) > CHANGED_ACCEL
+
+    def is_changing(self, force: Float[Tensor, "B 2"]) -> Bool[Tensor, " B"]:
+        """Whether the force differs from that of the last second: the car brakes or pulls away. Errors of tilt and
+        accelerometers, which may look like any acceleration, do not change within seconds."""
+        return (force - self.last_force).norm(dim=-1) > CHANGING_ACCEL
 
     def meet_fix(self, epoch: Epoch, with_velocity: Bool[Tensor, " B"], still: Bool[Tensor, " B"]) -> Rest:
         """With the velocity of the window's fix; those before an acceleration or a turn do not count."""
@@ -205,7 +212,8 @@ class Rest(NamedTuple):
         left = torch.where(stationary, 0.0, self.left_s + span)
         known = torch.where(self.force.isnan(), force, torch.lerp(self.force, force, -math.expm1(-span / REST_S)))
         kept = torch.where((left > REST_S).unsqueeze(-1), math.nan, self.force)
-        return self._replace(force=torch.where(stationary.unsqueeze(-1), known, kept), left_s=left)
+        force_at_rest = torch.where(stationary.unsqueeze(-1), known, kept)
+        return self._replace(last_force=force, force=force_at_rest, left_s=left)
 
 
 class VibrationLevel(NamedTuple):
@@ -275,7 +283,7 @@ def vibration_level(means: Float[Tensor, "B k 6"]) -> Float[Tensor, " B"]:
 
 def _level(variances: Float[Tensor, "B 6"]) -> Float[Tensor, " B"]:
     force, rate = variances.unflatten(-1, (2, 3)).sum(-1).unbind(-1)
-    level = (force * rate).sqrt()
+    level = ((force + LEAST_FORCE**2) * (rate + LEAST_RATE**2)).sqrt()
     return torch.where(level.isnan(), math.inf, level)
 
 
@@ -310,7 +318,8 @@ def detect_stationary(
     unlearned = before.standing.isinf() & before.moving.isinf()
     doubt = torch.where(unlearned, doubt.clamp_max(UNLEARNED_ACCEL), doubt)
     straight = turn < STILL_RATE + 2 * diagonal[:, GYRO].sum(-1).sqrt()
-    force = whole[:, :2] + epoch.imu_error[:, :2]
+    force, force_now = (x[:, :2] + epoch.imu_error[:, :2] for x in (whole, mean))
+    doubt = torch.where(before.rest.is_changing(force_now), 0.0, doubt)
     straight = straight & ~before.rest.has_changed(force)
     still, still_long = (straight & (gained < limit + doubt) for limit in (STILL_ACCEL, LONG_ACCEL))
     fixed, with_velocity = epoch.used[:, :2].all(-1), epoch.used[:, 3:5].all(-1)

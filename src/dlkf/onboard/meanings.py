@@ -62,6 +62,7 @@ MEMORY = {  # by the last parts of a field's name
     "liveliness.still_s": "s without acceleration or turn",
     "liveliness.calm_s": "s of these at a level that may be a standstill",
     "liveliness.rest_s": "s of these at the level of one",
+    "rest.last_force": "specific force of the last second, forward and right, as measured [m/s²]; NaN: none",
     "rest.force": "specific force of the last standstill, forward and right, as measured [m/s²]; NaN: none",
     "rest.left_s": "s since that standstill",
     "rest.velocity": "mean velocity of the fixes since the car shows no acceleration and no turn, north and east [m/s]",
