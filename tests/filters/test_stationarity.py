@@ -116,7 +116,8 @@ def test_a_car_that_pulls_away_in_an_outage_is_not_held_by_its_standstill(name):
 @pytest.mark.parametrize("last_force", [-1.3, -0.7])
 def test_a_rolling_stop_is_no_standstill(last_force):
     """A car brakes at 0.7 m/s² from 0.75 to 0.05 m/s, as calm as at rest, and errors of tilt may explain that: a
-    standstill if the force was the same a second before, none if the car braked harder."""
+    standstill if the force was the same a second before, none if the car braked harder, or if nothing is learned of
+    it."""
     seen = []
 
     class Seen(CarConstraints):
@@ -141,6 +142,8 @@ def test_a_rolling_stop_is_no_standstill(last_force):
     before = before._replace(rest=before.rest._replace(last_force=torch.tensor([[last_force, 0.0]], dtype=D)))
     stationary, *_ = detect_stationary(epoch, 0 * along, P, before, prior)
     assert stationary.item() == (last_force == -0.7)
+    unlearned = before._replace(moving=torch.full_like(before.moving, math.inf))
+    assert not detect_stationary(epoch, 0 * along, P, unlearned, prior)[0].any()
 
 
 def test_a_force_that_changes_within_a_second_is_an_acceleration():
