@@ -102,6 +102,7 @@ def test_engines_that_are_not_there(monkeypatch):
         list(parallel_map(half, [1], "dask://127.0.0.1:9"))
 
 
+@pytest.mark.commands
 def test_a_dask_worker_is_killed_in_the_middle(alone, cluster, where, tmp_path):
     """What the lost worker had is done again by the other: the bytes of every file are those of one process."""
     done = []

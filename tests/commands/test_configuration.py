@@ -106,7 +106,9 @@ def test_all_folders_are_covered():
     assert folders == {f for groups in GROUPS.values() for f in groups.values()} | {"experiment", "noise", "profile"}
 
 
-@pytest.mark.parametrize("name", [pytest.param(x, marks=[pytest.mark.whole] * x.startswith("train ")) for x in CASES])
+@pytest.mark.parametrize(
+    "name", [pytest.param(x, marks=[pytest.mark.commands] * x.startswith("train ")) for x in CASES]
+)
 def test_every_preset_composes_and_builds(name):
     wrong, primary = [], name.split()[0]
     for overrides in CASES[name]:

@@ -102,7 +102,10 @@ def test_output_that_cannot_be_written_ends_as_usual():
 @pytest.mark.whole
 @pytest.mark.parametrize(
     "given",
-    [{"PYTHONIOENCODING": "latin-1"}, {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}],
+    [
+        pytest.param({"PYTHONIOENCODING": "latin-1"}, marks=pytest.mark.commands),
+        {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"},
+    ],
     ids=["latin-1", "ascii"],
 )
 def test_an_encoding_without_some_letters_fails_no_command(given, town, tmp_path):

@@ -252,6 +252,7 @@ def test_the_sensor_that_an_imu_lacks_is_named(kept, lacks, tmp_path, drive):
         assert said.startswith(f"{file}: no IMU found") and f", without {lacks})" in said
 
 
+@pytest.mark.commands
 def test_a_table_of_a_hundred_thousand_columns(tmp_path):
     (tmp_path / "a.csv").write_text("\n".join(",".join(f"{c}{k}" for k in range(100_000)) for c in ("c", "", "1")))
     assert "a table of 100000 columns, which no log has" in refusal(tmp_path)

@@ -19,7 +19,7 @@ def drives(tmp_path_factory):
     return folder
 
 
-@pytest.mark.parametrize("states", [15, 33])
+@pytest.mark.parametrize("states", [pytest.param(15, marks=pytest.mark.commands), 33])
 @pytest.mark.whole
 def test_it_goes_the_way_of_an_independent_filter(states, drives, monkeypatch, tmp_path):
     """Within 3 mm with GNSS, where the error is 2 cm; 30 s without, after 50 s from a start 1° and 3° off, both

@@ -132,6 +132,7 @@ def _coarse(batch, count):
     return replace(batch, imu=imu, truth=NavState(*(x[:, every] for x in batch.truth)), **rows)
 
 
+@pytest.mark.commands
 def test_an_hour_without_gnss_keeps_state_and_covariance_sane():
     """A tunnel from the first minute on, IMU at 10 Hz and updates every 20 s: nothing grows that a wheel knows."""
     batch = _coarse(make_matched_batch(MatchedDrives(drives=2, minutes=60, rate_hz=10, seed=3), IMU)[0], 20)

@@ -339,10 +339,9 @@ FAULTS: dict[str, tuple[Fault, tuple[str, ...]]] = {
     "damage of all kinds": (_many, ("not_finite", "implausible", "double", "back")),
 }  # fmt: skip
 USUAL = (  # one of each kind, of every day's tests; all of them: pytest -m exports
-    "none", "single samples", "single fixes", "single samples of sensors", "a gap of 0.2 s", "a gap of 0.4 s",
-    "a gap of 4 s", "an IMU frozen for 5 s",
+    "none", "single samples", "single fixes", "a gap of 0.4 s", "a gap of 4 s", "an IMU frozen for 5 s",
     "spikes in the last and the last but one sample of an update interval", "a tenth of the samples missing",
     "clocks set back 50 s", "coarse positions alone, 3 s late", *JUMPS, *JUMPS_LATE, "a first fix 18 s ahead",
-    "wheel speeds at 100 Hz, some again after three seconds", "fix stamps that jitter", "sensors 15 s late",
-    "every third fix lost", "a position in two seconds", "a locked wheel on a moving car", "damage of all kinds",
+    "wheel speeds at 100 Hz, some again after three seconds", "fix stamps that jitter", "every third fix lost",
+    "a position in two seconds", "a locked wheel on a moving car", "damage of all kinds",
 )  # fmt: skip

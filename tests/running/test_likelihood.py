@@ -70,6 +70,7 @@ def test_gaps_are_withheld_and_scored(drives):
     assert torch.equal(evidence.batch.imu[0, : start.size[1]], start.imu[0])
 
 
+@pytest.mark.commands
 def test_noise_that_is_told_wrong_is_found(drives):
     found = find_noise(evidence_in_c(drives), "mbkf15", known_noise(0.05), Tuning(), delay=False)
     assert found.after < found.before - 1

@@ -117,7 +117,15 @@ def begun(minutes):
     return lambda name: deepcopy(run(name), {id(estimator(name)): estimator(name)})
 
 
-@pytest.mark.parametrize("fault,name", [(f, n) for f in FAULTS for n in FILTERS if n in OFTEN or f in HARDEST])
+@pytest.mark.parametrize(
+    "fault,name",
+    [
+        pytest.param(f, n, marks=[pytest.mark.commands] * (f not in HARDEST and n != "plus"))
+        for f in FAULTS
+        for n in FILTERS
+        if n in OFTEN or f in HARDEST
+    ],
+)
 def test_it_is_back_after_thirty_seconds_of_good_data(minutes, begun, fault, name):
     bad = FAULTS[fault](minutes)
     end = AT + {"15": 15.0, "5": 5.0}.get(fault.split()[-2], 1.0) + GOOD_S

@@ -51,6 +51,7 @@ def trained(dataset, tmp_path_factory) -> list:
     return [train(devices, dataset, tmp_path_factory.mktemp("run")) for devices in (1, 2)]
 
 
+@pytest.mark.commands
 def test_two_processes_learn_what_one_does(trained):
     """Averaged gradients are sums in another order: rounding, which the steps of two epochs spread a little."""
     (one, _), (two, _) = trained

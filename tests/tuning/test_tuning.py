@@ -54,6 +54,7 @@ def test_pva_is_the_geometric_mean_of_what_the_papers_tables_score(cars):
     assert evaluate_objective(build_filter("mbkf15", IMU), [cars], PVA) == pytest.approx(float(expected), rel=1e-4)
 
 
+@pytest.mark.commands
 def test_a_filter_tuned_for_gnss_throughout_beats_one_tuned_for_outages_there(cars):
     batches = {"log": [hidden(cars)], PVA: [cars]}
     tuned = {o: tune_filter(IMU, b, rounds=1, objective=o)[0] for o, b in batches.items()}
@@ -154,7 +155,7 @@ def test_many_segments_together_show_the_sensor_matrices_of_their_unit(cars):
     assert prior.std[of[1, (2, 0)]] > 0.015  # a car that does not roll shows nothing of this one
 
 
-@pytest.mark.parametrize("name", ["mbkf15", "mbkf33"])
+@pytest.mark.parametrize("name", ["mbkf15", pytest.param("mbkf33", marks=pytest.mark.commands)])
 def test_a_prior_of_one_segment_is_as_wide_as_the_turn_on_bias(cars, name):
     """One estimate has no scatter; NaN instead would make every filter with it diverge."""
     batch, expected, _ = one_unit(cars)
@@ -175,6 +176,7 @@ def test_a_filter_that_is_told_its_unit_drifts_less(cars):
     assert expected < 0.8 * untold
 
 
+@pytest.mark.commands
 def test_the_best_prior_is_the_best_of_all_that_were_tried(cars, monkeypatch):
     """Of factors and spreads, for biases and sensor matrices apart, with the means of longer segments."""
     monkeypatch.setattr("dlkf.tuning.search.BIAS_SPREADS", (3.0, 0.3))
