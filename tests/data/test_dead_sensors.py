@@ -52,6 +52,18 @@ def test_positions_alone_show_the_motion(imu, gnss):
         check_frozen(imu, alone, "town")
 
 
+def test_a_car_that_stops_in_a_gap_of_the_fixes_is_not_taken_for_moving(imu, gnss):
+    """The last fix before shows a speed, the first one after comes when it has stood for a while."""
+    repeated = (imu["t"] > 153) & (imu["t"] < 165)
+    imu["gyro_z"][repeated] = 0.0
+    gap = (gnss["t"] < 146) | (gnss["t"] > 178)
+    check_frozen(imu, {name: x[gap] for name, x in gnss.items()}, "town")
+    moving = (imu["t"] > 100) & (imu["t"] < 103)
+    imu["gyro_z"][moving] = 0.0
+    with pytest.raises(InputError, match="gyro_z stays at 0 from t = 100"):
+        check_frozen(imu, {name: x[gap] for name, x in gnss.items()}, "town")
+
+
 @pytest.mark.parametrize(("rate", "force"), [(0.06, 0.02), (0.25, 0.1), (1.0, 0.5), (2.0, 1.0)])
 def test_coarse_sensors_repeat_themselves(imu, gnss, rate, force):
     """Steps of up to 2 °/s; one axis at a time, since the others tell a frozen IMU."""

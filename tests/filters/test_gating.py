@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from dlkf.filters.build import build_filter
+from dlkf.filters.coasting import Coasting
 from dlkf.filters.gating import (
     AGREEMENT_RATES,
     COARSE_FLOOR,
@@ -265,6 +266,51 @@ def test_a_stationary_car_may_have_a_receiver_that_holds_its_position(name):
     batch = slipping(3, 120, (0.0,) * 5, stop=60.0)
     held = stopped_receiver(batch, slice(62, 120), 0.0)
     assert solved(held, name).used.all()
+
+
+def extrapolated(batch, epochs: slice):
+    """Fixes that go on from the first of these epochs with its velocity, as of a receiver in a tunnel."""
+    gnss = batch.gnss.clone()
+    age = torch.arange(epochs.stop - epochs.start, dtype=gnss.dtype)[:, None]
+    first = gnss[:, epochs.start, None]
+    gnss[:, epochs, :3], gnss[:, epochs, 3:] = first[..., :3] + age * first[..., 3:], first[..., 3:]
+    return replace(batch, gnss=gnss)
+
+
+@pytest.mark.parametrize("name", ["mbkf15", "mbkf21_car", "plus"])
+def test_fixes_that_a_receiver_extrapolates_are_not_used(name):
+    """For ten seconds in a bend: after the first second or two nearly the solution without them."""
+    batch = cars(name, 60)
+    coasting = extrapolated(batch, slice(40, 50))
+    both = solved(beside(coasting, hidden(batch, slice(41, 50))), name)
+    found, without = both.posterior.p_n.split(3)
+    off = (coasting.gnss[:, 49, :2] - batch.truth.p_n[:, 49, :2]).norm(dim=-1)
+    assert off.min() > 8.0 and not both.used[:3, 43:50].any() and both.used[:3, 50:].all()
+    assert (found - without)[:, 49, :2].norm(dim=-1).max() < 0.1 * off.max()
+
+
+def test_velocities_that_repeat_are_no_extrapolation_where_the_car_keeps_its_own():
+    """At constant speed straight on all fixes count, and of a car that speeds up those with another velocity."""
+    batch = cars("mbkf15", 30)
+    epoch = epoch_of(batch, batch.start, ImuError(batch.imu.new_zeros(len(batch.imu), 6)))
+    P = 1e-6 * torch.eye(15, dtype=torch.float64).repeat(len(batch.imu), 1, 1)
+    still = epoch._replace(
+        window=epoch.window._replace(end=epoch.start), fix=epoch.fix._replace(used=epoch.used | True)
+    )
+    faster, slower = (epoch.start._replace(v_n=epoch.start.v_n + x) for x in (0.5, -0.5))
+    value = torch.zeros_like(still.fix.value)
+    value[:, 3] = 10.0
+    state = Coasting.begin(P)
+    for end, metres, expected in ((epoch.start, 0.0, (0, 0)), (epoch.start, 1.0, (0, 0)), (faster, 2.0, (1, 1)),
+                                  (slower, 3.0, (1, 1)), (epoch.start, 3.0, (0, 1))):  # fmt: skip
+        fix = value.clone()
+        fix[:, :2] = value[:, :2] + metres * value[:, 3:5]
+        state = state.update(
+            still._replace(window=still.window._replace(end=end), fix=still.fix._replace(value=fix)), P
+        )
+        assert (state.found == torch.tensor(expected, dtype=torch.bool)).all()
+    value[:, 3:5] += 0.02
+    assert not state.update(still._replace(fix=still.fix._replace(value=value)), P).found.any()
 
 
 @pytest.mark.parametrize("name", ["mbkf15_gated", "mbkf21_car_gated", "plus"])

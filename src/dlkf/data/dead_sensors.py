@@ -13,6 +13,7 @@ from dlkf.data.tables import Columns
 
 MOVING, TURNED, SPEED_CHANGE = 3.0, 1.0, 3.0  # m/s; rad and m/s over a drive that an axis at work must show
 WAY_S = 5.0
+NEAR_S = 2.0  # from a fix up to which its speed is that of the car, or two intervals of the receiver
 NOISELESS = 0.2  # of the time in motion that samples repeat
 LEAST_SAME = 10  # samples of an axis that is stuck
 SOME_SAME, COARSE = 0.2, 0.01  # of FROZEN_IMU_S; of the time in motion that a coarse axis repeats so long
@@ -90,8 +91,19 @@ def _find_repeats(t: np.ndarray, changed: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def _moves(fixes: tuple[np.ndarray, np.ndarray], begin: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Whether the car moves at both times, by the fixes' times and speeds."""
-    return np.minimum(*(np.interp(x, *fixes) for x in (begin, end))) > FROZEN_SPEED_M_S
+    """Whether the car moves at both times, by the fixes' times and speeds; not known, so no, far from any fix."""
+    return _moves_at(fixes, begin) & _moves_at(fixes, end)
+
+
+def _moves_at(fixes: tuple[np.ndarray, np.ndarray], t: np.ndarray) -> np.ndarray:
+    """Whether the car moves at a time."""
+    times, speeds = fixes
+    if len(times) < 2:
+        return np.zeros(len(t), bool)
+    after = np.searchsorted(times, t).clip(1, len(times) - 1)
+    away = np.minimum(np.abs(t - times[after - 1]), np.abs(t - times[after]))
+    near = max(NEAR_S, 2 * float(np.median(np.diff(times))))
+    return (np.interp(t, times, speeds) > FROZEN_SPEED_M_S) & (away < near)
 
 
 def _find_stuck(

@@ -14,11 +14,12 @@ A filter that is sure of a wrong position would refuse good fixes; so with ``PAT
 other they pass, and z² is added to the variance: the position is elsewhere, for whichever reason, and attitude and
 biases need not explain it. Velocities do not pass in this way while positions in the same fixes show that they are
 wrong: those are no outliers, but would be if the filter had moved with the refused velocities. Nor do such velocities
-become usual. A receiver that repeats the same fix while the car moves is frozen, and not used until it changes.
+become usual. A receiver that repeats the same fix while the car moves is frozen, and not used until it changes; one
+that extrapolates its last fix neither (:mod:`dlkf.filters.coasting`).
 
 Filters without that gate have a coarse one that cannot be switched off (:class:`CoarseGate`): a fix ``COARSE_SIGMAS``
 off, such as the first one after a tunnel, is left out, and so are the fixes of a frozen receiver: positions that are
-the same to the bit while the filter has moved. On data whose noise is as stated it never acts.
+the same to the bit while the filter has moved, or those that coast. On data whose noise is as stated it never acts.
 """
 
 from __future__ import annotations
@@ -32,9 +33,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dlkf.filters.branches import may_branch
+from dlkf.filters.coasting import Coasting, acceleration_variance
 from dlkf.filters.integration import Epoch
-from dlkf.navigation.earth import STANDARD_GRAVITY
-from dlkf.navigation.state import ACCEL, ATTITUDE, POSITION, PV, VELOCITY
+from dlkf.navigation.state import POSITION, PV, VELOCITY
 
 PATIENCE = 2  # refused fixes in a row that agree with each other before the filter follows them
 AGREEMENT_SIGMAS, AGREEMENT_RATES = 6.0, (5.0, 2.0)  # two refusals agree within 6σ of the fixes + 5 m/s, 2 m/s² · time
@@ -71,6 +72,7 @@ class GateMemory(NamedTuple):
     age: Tensor  # (B, 2) s since then
     fix: Tensor  # (B, 3) the last position offered
     frozen: Tensor  # (B,) bool: it did not move with the car
+    coasting: Coasting
     limits: Tensor  # (1, 4) of d² of each part over s², the same for all drives
 
 
@@ -98,6 +100,7 @@ class CoarseMemory(NamedTuple):
     place: Tensor  # (B, 3) the last position offered
     moved: Tensor  # (B, 3) m, how far the filter has moved while it was the same
     frozen: Tensor  # (B,) bool: further than a fix can be the same
+    coasting: Coasting
 
 
 @runtime_checkable
@@ -129,7 +132,10 @@ class CoarseGate:
         """Nothing refused yet; ``like`` (B, …) gives batch and precision."""
         B, zeros = len(like), like.new_zeros
         nowhere = torch.full_like(zeros(B, 3), torch.nan)
-        return CoarseMemory(zeros(B), zeros(B, 6), zeros(B) > 0, zeros(B), nowhere, zeros(B, 3), zeros(B) > 0)
+        nothing = zeros(B) > 0
+        return CoarseMemory(
+            zeros(B), zeros(B, 6), nothing, zeros(B), nowhere, zeros(B, 3), nothing.clone(), Coasting.begin(like)
+        )  # fmt: skip
 
     def screen_fix(
         self, memory: CoarseMemory, epoch: Epoch, P: Float[Tensor, "B n n"], R: Float[Tensor, "B 6"]
@@ -139,11 +145,12 @@ class CoarseGate:
         with torch.no_grad():
             span, variance = epoch.span_s, P.diagonal(dim1=-2, dim2=-1)
             grown = torch.cat((variance[:, :3] + span * span * variance[:, 3:6], variance[:, 3:6]), -1)
-            memory = self._find_frozen(memory, epoch, grown)
-        quiet = ~(memory.refused > 0) & ~memory.frozen
+            memory = self._find_frozen(memory, epoch, grown)._replace(coasting=memory.coasting.update(epoch, P))
+        stale = memory.frozen.unsqueeze(-1) | memory.coasting.found
+        quiet = ~(memory.refused > 0) & ~stale.any(-1)
         if may_branch(epoch.z) and float(epoch.z.detach().abs().max()) <= NEAR and bool(quiet.all()):
             return memory, epoch, P
-        offered = epoch.used & ~memory.frozen.unsqueeze(-1)
+        offered = epoch.used & ~stale.repeat_interleave(3, -1)
         epoch = epoch._replace(z=epoch.z * offered, fix=epoch.fix._replace(used=offered))
         with torch.no_grad():
             memory, verdict = self._judge(memory, epoch, grown)
@@ -217,7 +224,10 @@ class Gate:
         limits = like.new_tensor([[self._limits[k] for k in (2, 1, 2, 1)]])
         nowhere = torch.full_like(zeros(B, 3), torch.nan)
         usual = zeros(B, 4) + self.usual
-        return GateMemory(usual, zeros(B, 2), zeros(B, 6), zeros(B, 2), nowhere, zeros(B) > 0, limits)
+        nothing = zeros(B) > 0
+        return GateMemory(
+            usual, zeros(B, 2), zeros(B, 6), zeros(B, 2), nowhere, nothing, Coasting.begin(like), limits
+        )  # fmt: skip
 
     def screen_fix(
         self, memory: GateMemory, epoch: Epoch, P: Float[Tensor, "B n n"], R: Float[Tensor, "B 6"]
@@ -238,9 +248,10 @@ class Gate:
         position = used[:, :3].any(-1)
         same = (epoch.fix.value[:, :3] == memory.fix).all(-1) & position
         frozen = same & (memory.frozen | (epoch.window.end.v_n.norm(dim=-1) > FROZEN_SPEED))
+        coasting = memory.coasting.update(epoch, P)
         S = _predicted_variance(epoch, P) + R + FLOOR * FLOOR
         square = average_by_part(torch.where(used, z.square() / S, 0.0))
-        offered = used[:, PARTS] & ~frozen.unsqueeze(-1)
+        offered = used[:, PARTS] & ~(frozen.unsqueeze(-1) | coasting.found)[:, [0, 0, 1, 1]]
         limit = memory.limits * torch.exp(memory.usual)
         outlier = offered & (square > limit)
         wrong = torch.stack((outlier[:, :2].any(-1), outlier[:, 2:].any(-1)), -1)
@@ -274,6 +285,7 @@ class Gate:
             torch.where(wrong, 0.0, age),
             torch.where(position.unsqueeze(-1), epoch.fix.value[:, :3], memory.fix),
             torch.where(position, frozen, memory.frozen),
+            coasting,
             memory.limits,
         ), passed, torch.where(of_components & passed, z * z, 0.0)  # fmt: skip
 
@@ -290,11 +302,9 @@ def average_by_part(x: Float[Tensor, "B 6"]) -> Float[Tensor, "B 4"]:
 
 def _predicted_variance(epoch: Epoch, P: Float[Tensor, "B n n"]) -> Float[Tensor, "B 6"]:
     """Variance of position and velocity at the end of the window, of P at its start: to first order, correlations left
-    out. Acceleration is unknown by what tilt makes of gravity, heading of the horizontal force, and by its bias."""
+    out."""
     span, variance = epoch.span_s, P.diagonal(dim1=-2, dim2=-1)
-    force = epoch.corrected[..., :2].mean(1).square().sum(-1)
-    tilt, heading = variance[:, ATTITUDE][:, :2].amax(-1), variance[:, ATTITUDE][:, 2]
-    acceleration = STANDARD_GRAVITY**2 * tilt + force * heading + variance[:, ACCEL].amax(-1)
+    acceleration = acceleration_variance(epoch, P)
     velocity = variance[:, VELOCITY] + span**2 * acceleration.unsqueeze(-1)
     position = variance[:, POSITION] + span**2 * variance[:, VELOCITY] + 0.25 * span**4 * acceleration.unsqueeze(-1)
     return torch.cat((position, velocity), -1)

@@ -16,6 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dlkf.filters.adaptive import AdaptiveNoise
+from dlkf.filters.coasting import Coasting
 from dlkf.filters.fix_noise import FixNoise
 from dlkf.filters.gating import CoarseMemory, GateMemory
 from dlkf.filters.learned import LearnedMemory
@@ -93,6 +94,7 @@ RULES: Rules = {
     KalmanMemory: {"P": FrameChange.covariance},
     WindowModel: lambda change, old, fresh: replace(fresh, density=old.density),
     AdaptiveNoise: {"Q": FrameChange.covariance, "R": FrameChange.variances},
+    Coasting: {"velocity": FrameChange.forget},
     GateMemory: {"innovation": FrameChange.vectors, "fix": FrameChange.forget},
     CoarseMemory: {"fix": FrameChange.fixes, "place": FrameChange.forget, "moved": FrameChange.vectors},
     PositionSpan: begin_anew,  # the height of its place is not kept
