@@ -4,7 +4,8 @@
 
 From the first on, fixes get errors that the reported 1σ does not know: positions off by 3, 1 or 30 m (1σ per axis) in
 some seconds, by one error of 3 m for ten seconds about every 50 s, by 0.3, 1 or 3 m in all, or by 1 m that wanders over
-30 s; velocities off by 5 m/s in some, by 0.5 m/s in all, or those of a second before. Or the IMU has a turn-on bias, of
+30 s; velocities off by 5 m/s in some, by 0.5 m/s in all, or those of a second before; or the receiver extrapolates for
+five seconds about every 50 s. Or the IMU has a turn-on bias, of
 random direction, beside its own, gyroscopes whose scale factors are 1 or 3 % off, or biases that step. Or the files are
 wrong: stamps of fixes 0.1 or 0.3 s late, clocks 100 or 300 ppm apart, an antenna 1.4 m from where the lever arm says,
 one of 500 samples of a sensor spoiled.
@@ -115,6 +116,20 @@ def late(drive: Drive, g: torch.Generator) -> Drive:
     return replace(drive, gnss_v_e=v_e, gnss_valid=valid)
 
 
+def extrapolated(seconds: int) -> Change:
+    """Fixes that go on from the one before with its velocity for so long, again and again."""
+
+    def change(drive: Drive, g: torch.Generator) -> Drive:
+        r_e, v_e, k = drive.gnss_r_e.clone(), drive.gnss_v_e.clone(), 0
+        while (k := k + int(torch.randint(*EVERY_S, (1,), generator=g))) < len(r_e):
+            age = drive.epoch_s * torch.arange(1, 1 + min(seconds, len(r_e) - k), dtype=r_e.dtype).unsqueeze(-1)
+            r_e[k : k + seconds], v_e[k : k + seconds] = r_e[k - 1] + age * v_e[k - 1], v_e[k - 1]
+            k += seconds
+        return replace(drive, gnss_r_e=r_e, gnss_v_e=v_e)
+
+    return change
+
+
 def biases(accel: float, gyro_dps: float) -> Change:
     """Accelerometers and gyroscopes off by so much RMS over their axes [m/s², °/s]."""
 
@@ -164,8 +179,9 @@ ERRORS: Mapping[str, Change] = {
     "scale factors of the gyroscopes 1 % off": gyro_scale(0.01),
     "3 % off": gyro_scale(0.03),
     "biases that step by 0.1 m/s², 0.15 °/s": bias_steps(0.1, 0.15),
+    "fixes extrapolated for 5 s": extrapolated(5),
 }
-OF_VELOCITIES, OF_IMU = [*ERRORS][9:12], [*ERRORS][12:16]
+OF_VELOCITIES, OF_IMU = [*[*ERRORS][9:12], [*ERRORS][-1]], [*ERRORS][12:16]
 SPIKED = 1 / 500
 WIDE_ACCEL = {"turn_on_bias": 0.5}  # m/s², 1σ
 WIDE_GYRO = {"turn_on_bias": math.radians(2.0), "scale_factor": 0.02}
@@ -222,6 +238,9 @@ OF_FILES: Mapping[str, Callable[[CheckedTables], CheckedTables]] = {
 }
 
 
+KINDS = (*ERRORS, *OF_FILES)
+
+
 def from_wrong_files(folder: Path, kind: str) -> list[Drive]:
     """The drives of a dataset whose files are wrong."""
     tables = [OF_FILES[kind](read_drive(folder, row)) for row in drive_rows(folder)]
@@ -242,11 +261,13 @@ def rivals() -> dict[str, Estimator]:
     return {**filters, f"plus, {without}": parts("plus")[without], "plus": trained_filter("plus")}
 
 
-def outage_rows(name: str, folder: Path, filters: Mapping[str, Estimator]) -> Iterator[tuple[str, str, Row]]:
-    """Where, kind of error and row of every kind that a dataset can have."""
+def outage_rows(
+    name: str, folder: Path, filters: Mapping[str, Estimator], kinds: Sequence[str]
+) -> Iterator[tuple[str, str, Row]]:
+    """Where, kind of error and row of those of ``kinds`` that a dataset can have."""
     drives = load(folder)
     moves = any(bool(d.gnss_valid[:, 3:].any()) for d in drives)
-    for kind in (*ERRORS, *OF_FILES):
+    for kind in kinds:
         if (kind in OF_VELOCITIES and not moves) or (kind in OF_IMU and name not in REAL):
             continue
         wrong = from_wrong_files(folder, kind) if kind in OF_FILES else [with_errors(d, kind) for d in drives]
@@ -345,21 +366,23 @@ def main() -> None:
     arguments.add_argument("--real", type=Path, required=True, help="folder of real datasets")
     arguments.add_argument("--data", type=Path, default=Path("data/plus"), help="where test sets lie, or are made")
     arguments.add_argument("--out", type=Path, default=Path("outputs/wrong_sensors"))
+    arguments.add_argument("--errors", nargs="+", choices=KINDS, help="these kinds alone, without starts")
     options = arguments.parse_args()
     torch.set_num_threads(1)
     options.out.mkdir(parents=True, exist_ok=True)
     names = (*INJECTED, *REAL, *WITH_VELOCITIES, "puck")
     simulate_sets(options.data, options.real, [name for name in names if name not in REAL])
     folders = {name: (options.real if name in REAL else options.data) / name for name in names}
-    sets = {name: beginnings(name, load(folders[name])) for name in (*POSITIONS_ALONE, *WITH_VELOCITIES)}
-    (options.out / "starts.md").write_text("\n".join(start_table(sets)) + "\n")
+    if not options.errors:
+        sets = {name: beginnings(name, load(folders[name])) for name in (*POSITIONS_ALONE, *WITH_VELOCITIES)}
+        (options.out / "starts.md").write_text("\n".join(start_table(sets)) + "\n")
     filters, rows = rivals(), {}
     for name in (*INJECTED, *REAL, FLEET):
-        for where, kind, row in outage_rows(name, folders[name], filters):
+        for where, kind, row in outage_rows(name, folders[name], filters, options.errors or KINDS):
             rows.setdefault((where, kind), []).append(row)
         print(name, flush=True)
     order = ("real motion", "real drives", "simulated")
-    rows = dict(sorted(rows.items(), key=lambda x: (order.index(x[0][0]), [*ERRORS, *OF_FILES].index(x[0][1]))))
+    rows = dict(sorted(rows.items(), key=lambda x: (order.index(x[0][0]), KINDS.index(x[0][1]))))
     (options.out / "outages.md").write_text("\n".join(table(rows)) + "\n")
     (options.out / "manifest.json").write_text(json.dumps(describe_provenance(), indent=1) + "\n")
 

@@ -168,6 +168,25 @@ def test_sensors_that_round_find_the_same_standstills():
     assert taken[:, 60:].float().mean() > 0.9
 
 
+@pytest.mark.parametrize("name", ["mbkf15_nhc", "mbkf33_car"])
+def test_a_gyroscope_that_reads_the_same_shows_nothing_of_its_bias(name):
+    """It holds back its rate at rest: a bias that was found in motion stays, and the car is held all the same."""
+    batch = shaken((0.05, 4e-3), (0.2, 8e-3), SWAY)
+    batch = replace(batch, available=torch.ones_like(batch.available))
+    rest = (batch.truth.v_n.norm(dim=-1) < 0.01)[..., None, None]
+    imu = batch.imu.clone()
+    imu[..., 3:] += 0.004  # 0.2 °/s
+    usual = replace(batch, imu=imu.clone())
+    imu[..., 5:] = torch.where(rest, 0.0, imu[..., 5:])
+    silent = replace(batch, imu=imu)
+    taken, solution = watched(beside(usual, silent), name)
+    assert taken[:, int(STOP) + 3 :].float().mean() > 0.8
+    at, end = int(STOP) - 1, -1
+    moved = (solution.imu_error[:, end, 5] - solution.imu_error[:, at, 5]).abs().chunk(2)
+    off = (solution.imu_error[:, end, 5] - batch.true_imu_error[:, end, 5].repeat(2) - 0.004).abs().chunk(2)
+    assert off[0].max() < 1e-3 and moved[1].max() < 1e-3
+
+
 def test_the_force_of_a_standstill_is_known_during_it_and_for_seconds_after():
     rest = Rest.begin(torch.zeros(1, dtype=D), 2)
     at_rest, off = torch.tensor([[0.1, 0.0], [0.0, -0.1]], dtype=D), torch.tensor([1.2 * CHANGED_ACCEL, 0.0], dtype=D)

@@ -8,7 +8,8 @@ with ψ, θ the direction in which the car moves relative to the IMU's axes (mou
 the IMU sits, k the sideslip per lateral acceleration and speed (single-track model), and s how far its springs let the
 car pitch back per specific force f_x forward (pitch gradient; Gillespie 1992). Plain, all five are zero; with structure
 they are further states of the filter. A standstill (:mod:`dlkf.filters.stationarity`) measures v = 0
-(zero-velocity update) and ω_b = Earth rate (zero-angular-rate update).
+(zero-velocity update) and ω_b = Earth rate (zero-angular-rate update). A gyroscope that reads the same all the time
+rounds, or holds back a rate that it takes for none, so it shows nothing of its bias.
 
 Roads shake a car across its way by more than that, and its springs bring it back. So velocity and rate are means over
 the last ``MEAN_S``, in which the errors of the filter count as constant. A pothole or a knock may still make a row off
@@ -41,6 +42,7 @@ STRUCTURE_WALK_STD = (2e-5, 2e-5, 1e-4, 1e-6, 1e-6)  # per √s
 MEAN_S = 0.5  # of velocity and rate across the car, at most an epoch
 SPRINGS_S = 0.3  # the springs follow the force so slowly: it is averaged over so long, at most an epoch
 OUTLIER = 3.0  # σ of an innovation across the car, from which on its 1σ grows with it
+SHOWN_RATE_STD = 1e-6  # rad/s: with a smaller spread a gyroscope reads the same in every sample
 SLOWEST = 0.5  # m/s: below, course and yaw rate do not show the vehicle parameters
 
 
@@ -82,7 +84,8 @@ class CarConstraints:
         zr, Hr = self._measure_standstill(epoch)
         resting, liveliness, rate_variance = self.detect_rest(epoch, zr[:, 3:], prediction, memory)
         resting = resting.unsqueeze(-1)
-        used = torch.cat(((moving.unsqueeze(-1) & ~resting).expand(-1, 2), resting.expand(-1, 6)), -1)
+        shown = resting & (rate_variance > SHOWN_RATE_STD**2)
+        used = torch.cat(((moving.unsqueeze(-1) & ~resting).expand(-1, 2), resting.expand(-1, 3), shown), -1)
         per_second = max(1.0, 1.0 / epoch.span_s)
         variance = (memory.std.square() * per_second).expand(len(zn), -1)
         if epoch.advice is not None and epoch.advice.across is not None:
