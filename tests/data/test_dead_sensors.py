@@ -43,6 +43,7 @@ def test_an_axis_that_sticks_is_refused(imu, gnss, name, begin, end):
         ) as error:
             check_frozen(imu, gnss, "town")
         assert "\n" not in str(error.value)
+        assert ("dead band" in str(error.value)) == (name == "gyro_z" and value == 0)
 
 
 def test_positions_alone_show_the_motion(imu, gnss):

@@ -144,6 +144,10 @@ BAD = {
     "a single fix": (_rows("gnss", lambda f: f[:1].assign(t=0.0)), "the only fix, at t = 0.000, .*all along the drive"),
     "nan time": (_set("gnss", "t", _at(3, np.nan)), "row 3: t is nan"),
     "frozen IMU": (_freeze(3000, 3100), r"the same sample from t = 30\.0.* a frozen IMU"),
+    "samples of a busy host": (
+        _set("imu", "t", lambda t: np.concatenate((t[:1000], t[1029] - 1e-4 * np.arange(29, -1, -1), t[1030:]))),
+        "its samples come at once after it, as a host stamps them that was busy",
+    ),
     "IMU gap": (_rows("imu", lambda f: f.drop(f.index[1000:1100])), "IMU gap of 1.010 s after t = 10.000"),
     "no samples": (_rows("imu", lambda f: f.iloc[:0]), "has no rows"),
     "no fixes": (_rows("gnss", lambda f: f.iloc[:0]), "has no rows"),

@@ -66,9 +66,11 @@ def check_frozen(imu: Columns, gnss: Columns, where: str) -> None:
         begin, end = _find_repeats(t, changed)
         if (end - begin > FROZEN_IMU_S).any() and (stuck := _find_stuck(imu[name], t, begin, end, fixes)) is not None:
             first, last = stuck
+            value = imu[name][np.searchsorted(t, first)]
+            band = ", or small rates are read as 0 (switch such a dead band off)" if name in GYRO and value == 0 else ""
             raise InputError(
-                f"{where}: {name} stays at {imu[name][np.searchsorted(t, first)]:g} from t = {first:.3f} to {last:.3f} "
-                f"while the car moves and other axes change: stuck or saturated; {remedy}"
+                f"{where}: {name} stays at {value:g} from t = {first:.3f} to {last:.3f} "
+                f"while the car moves and other axes change: stuck or saturated{band}; {remedy}"
             )
 
 

@@ -23,6 +23,7 @@ from dlkf.data.schema import ACCEL, ATTITUDE, GYRO, POSITION, STD, VELOCITY, sta
 from dlkf.data.tables import Columns, DriveRow, read_drives, read_table, refuse_rows
 from dlkf.data.turn_checks import check_turns
 
+STAMPS = "give the sensor's own stamps, or spread the samples evenly (reader.imu.time.respace=true)"
 GNSS_QUALITIES = (1, 2, 3, 4, 5, 9)  # NMEA GGA codes that are a satellite fix; 6, 7, 8 are not
 RATES_HZ = {"imu": (1.0, 1e4), "gnss": (1e-3, 500.0)}
 UNITS = {"ms": 1e3, "us": 1e6, "ns": 1e9}  # of time, in a second
@@ -234,7 +235,7 @@ def _check_imu(imu: Columns, where: str, limits: Limits) -> Columns:
     if (share := share_at_once(t)) > MANY:
         raise InputError(
             f"{where}: {100 * share:.0f} % of the samples came with the one before, as in packets that a host stamps; "
-            "give the sensor's own stamps, or spread the samples evenly (reader.imu.time.respace=true)"
+            f"{STAMPS}"
         )
     remedy = "remove the row or split the drive there"
     refuse_rows(imu, (*GYRO, *ACCEL), lambda x: ~np.isfinite(x), where, remedy)
@@ -254,11 +255,19 @@ def _check_imu(imu: Columns, where: str, limits: Limits) -> Columns:
         k = int(np.flatnonzero(keep)[gaps[0]])
         before = t[keep][gaps[0] - 1]
         left_out = "" if not len(beyond) else f" ({len(beyond)} samples beyond full scale are left out)"
+        remedy = "split the drive there (dlkf.ingest split_gaps=true)"
+        if _come_at_once(t, k, t[k] - before):
+            remedy = f"its samples come at once after it, as a host stamps them that was busy; {STAMPS}"
         raise InputError(
-            f"{where}: row {k}: IMU gap of {t[k] - before:.3f} s after t = {before:.3f}{left_out}; split the drive "
-            "there (dlkf.ingest split_gaps=true)"
+            f"{where}: row {k}: IMU gap of {t[k] - before:.3f} s after t = {before:.3f}{left_out}; {remedy}"
         )
     return imu if not len(beyond) else {column: values[keep] for column, values in imu.items()}
+
+
+def _come_at_once(t: np.ndarray, k: int, gap_s: float) -> bool:
+    """Whether nine of ten samples that a gap before row ``k`` lacks come in the tenth of its length after it."""
+    missing = 0.9 * gap_s / float(np.median(np.diff(t)))
+    return int(np.searchsorted(t, t[k] + 0.1 * gap_s)) - k >= missing
 
 
 def _check_scale(imu: Columns) -> np.ndarray:
