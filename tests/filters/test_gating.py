@@ -309,6 +309,8 @@ def test_velocities_that_repeat_are_no_extrapolation_where_the_car_keeps_its_own
             still._replace(window=still.window._replace(end=end), fix=still.fix._replace(value=fix)), P
         )
         assert (state.found == torch.tensor(expected, dtype=torch.bool)).all()
+    alone = still.fix._replace(value=value, used=still.fix.used & (torch.arange(6) < 3))
+    assert not state.update(still._replace(fix=alone), P).found.any()  # a position without a velocity
     value[:, 3:5] += 0.02
     assert not state.update(still._replace(fix=still.fix._replace(value=value)), P).found.any()
 

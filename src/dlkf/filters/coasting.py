@@ -55,7 +55,7 @@ class Coasting(NamedTuple):
         return Coasting(
             torch.where(m, place, self.place), torch.where(m, velocity, self.velocity), torch.where(moves, 0.0, age),
             torch.where(new.unsqueeze(-1), 0.0, gained), torch.where(new, 0.0, std),
-            torch.where(m, torch.stack((stale & along, stale), 1), self.found),
+            torch.where(epoch.used.any(-1, keepdim=True), torch.stack((stale & along, stale), 1), self.found),
         )  # fmt: skip
 
 
