@@ -15,7 +15,7 @@ help:
 	@echo "make paper     the paper's experiments and their page, days on a CPU; goes on where it stopped, takes REAL=data/kitti"
 	@echo "make plus      the tables of docs/results/plus.md, an hour; takes REAL=data/real, ARGS=--train for fresh weights and constants"
 	@echo "make check     tests of a developer, two to three minutes on two cores: without trainings, MLflow, compilers"
-	@echo "make test      all tests but the longest (pytest -m exports, -m commands), seven minutes on two cores"
+	@echo "make test      all tests but the longest (pytest -m exports, -m commands), eight minutes on two cores"
 	@echo "make mutants   whether the tests notice small faults of the core (tests/mutants.yaml)"
 	@echo "make lint      ruff, then make types"
 	@echo "make types     pyright over src and pipelines, under a minute"
