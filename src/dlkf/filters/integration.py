@@ -32,6 +32,7 @@ class Fix(NamedTuple):
     used: Tensor  # (B, 6) bool
     lag: Tensor | None  # (B,) s before the epoch's end; None: all on it
     aids: Mapping[str, Tensor] | None = None  # (B, 5) of further sensors by name, see dlkf.data.aids.ROW
+    velocity_lag: Tensor | None = None  # (B,) as lag, of the velocity; of an epoch of filters that estimate it
 
 
 class Epoch(NamedTuple):

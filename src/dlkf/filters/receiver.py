@@ -1,4 +1,4 @@
-"""What a log does not know of its receiver: how old a fix is at its stamp, how fast its clock, where the antenna is.
+"""What a log does not know of its receiver: the age of a fix and of its velocity, its clock, where the antenna is.
 
 With a delay d of the fixes and an antenna at l̂ = l + δl from the IMU, a fix that is stamped t is predicted as position
 and velocity of the antenna at t − d (:func:`dlkf.navigation.error_model.antenna`): between two samples of the window,
@@ -6,8 +6,12 @@ and beyond its ends with the acceleration a there. H has −v_a and −a for δd
 the filter's own error, which is in the innovation too), C and C [ω×] for δl, with v_a the velocity of the antenna, and
 λ + d for the age of the fix. a is the change of velocity over ``SLOPE_S`` to either side, inside
 the window: a mean over all of it lags when the car turns, and the delay seems too certain. A
-receiver's clock that is fast by r against that of the IMU makes the delay grow, ḋ = r (:func:`let_delay_grow`). A
-filter with the source ``+receiver`` (:class:`Receiver`) estimates d, δl and r.
+receiver's clock that is fast by r against that of the IMU makes the delay grow, ḋ = r (:func:`let_delay_grow`).
+
+Position and velocity of a fix are rarely of the same time: a velocity is a mean over a Doppler or carrier-phase
+interval, and lags, as a position does that the receiver smooths. The velocity is thus predicted at t − d − e, with −a
+of that time for δd and δe; the swing of the arm is that of the position. A filter with the source ``+receiver``
+(:class:`Receiver`) estimates d, e, δl and r.
 """
 
 from __future__ import annotations
@@ -26,6 +30,7 @@ from dlkf.navigation.error_model import ARM_RATE_S, antenna
 from dlkf.navigation.state import POSITION, ErrorStates, NavState
 
 DELAY = "fix_delay_s"
+VELOCITY_DELAY = "velocity_delay_s"
 ARM = ("lever_forward_m", "lever_right_m", "lever_down_m")
 DRIFT = "clock_drift_ppm"
 PPM = 1e-6
@@ -34,10 +39,11 @@ SLOPE_S = 0.2  # s to either side of a fix, over which the acceleration is a mea
 
 
 class Receiver(SensorSource):
-    """Delay of the fixes, antenna and clock; it has no rows of its own, those of the fix contain them."""
+    """Delays of fixes and velocities, antenna and clock; it has no rows of its own, those of the fix contain them."""
 
     parameters: ClassVar[Mapping[str, Parameter]] = {
         DELAY: Parameter(std=0.05, walk=1e-4, largest=0.9),
+        VELOCITY_DELAY: Parameter(std=0.2, largest=1.0),
         **{name: Parameter(std=0.2, largest=2.0) for name in ARM},
         DRIFT: Parameter(std=100.0, walk=0.1, largest=1000.0),
     }
@@ -77,31 +83,34 @@ def add_drift(Phi: Float[Tensor, "B n n"], states: ErrorStates, seconds: float) 
 
 
 def predict_fix(epoch: Epoch, parameters: Mapping[str, Tensor]) -> Epoch:
-    """The epoch with the innovation, and the state at the fix, that estimates (B,) of delay and antenna give."""
+    """The epoch with the innovation, and the state at the fix, that estimates (B,) of delays and antenna give."""
     arm = torch.stack([parameters[name] for name in ARM], -1)
     if epoch.lever_arm_b is not None:
         arm = arm + epoch.lever_arm_b
     lag, M, dt = parameters[DELAY], epoch.imu.shape[1], epoch.dt
     if epoch.fix.lag is not None:
         lag = lag + epoch.fix.lag
-    within = lag.clamp(0.0, M * dt)
+    lag_v = lag + parameters[VELOCITY_DELAY]
+    within, within_v = lag.clamp(0.0, M * dt), lag_v.clamp(0.0, M * dt)
     at_fix = epoch.window.interpolate_before(epoch.start, within, dt)
     few = max(1, min(M, round(ARM_RATE_S / dt)))
     rate, beyond = rate_before(epoch.corrected[..., 3:], within / dt, few), (lag - within).unsqueeze(-1)
     p, v = antenna(at_fix, rate, arm, epoch.frame).split(3, -1)
-    a = _acceleration(epoch, lag)
-    predicted = torch.cat((p - beyond * v + 0.5 * beyond.square() * a, v - beyond * a), -1)
-    z, fix = (epoch.fix.value - predicted) * epoch.used, epoch.fix._replace(lag=lag)
+    p = p - beyond * v + 0.5 * beyond.square() * _acceleration(epoch, lag)
+    v = v + epoch.window.velocity_before(epoch.start, within_v, dt) - at_fix.v_n
+    v = v - (lag_v - within_v).unsqueeze(-1) * _acceleration(epoch, lag_v)
+    z, fix = (epoch.fix.value - torch.cat((p, v), -1)) * epoch.used, epoch.fix._replace(lag=lag, velocity_lag=lag_v)
     return epoch._replace(at_fix=at_fix, rate_at_fix_b=rate, lever_arm_b=arm, z=z, fix=fix)
 
 
 def add_columns(H: Float[Tensor, "B 6 n"], epoch: Epoch, states: ErrorStates) -> Float[Tensor, "B 6 n"]:
-    """H with the columns of delay and antenna, for an epoch of :func:`predict_fix`."""
+    """H with the columns of delays and antenna, for an epoch of :func:`predict_fix`."""
     H, C, k = H.clone(), epoch.at_fix.C_nb, states.of(ARM[0]).start
     v = antenna(epoch.at_fix, epoch.rate_at_fix_b, epoch.lever_arm_b, epoch.frame)[:, 3:]
-    assert epoch.fix.lag is not None
-    moves, a = v.norm(dim=-1, keepdim=True) > MOVING, _acceleration(epoch, epoch.fix.lag)
+    assert epoch.fix.velocity_lag is not None
+    moves, a = v.norm(dim=-1, keepdim=True) > MOVING, _acceleration(epoch, epoch.fix.velocity_lag)
     H[:, :, states.of(DELAY).start] = torch.where(moves, -torch.cat((v, a), -1), 0.0)
+    H[:, 3:, states.of(VELOCITY_DELAY).start] = torch.where(moves, -a, 0.0)
     H[:, :, k : k + 3] = torch.cat((C, C @ skew(epoch.rate_at_fix_b)), 1)
     return H
 

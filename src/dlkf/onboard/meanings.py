@@ -27,6 +27,7 @@ COLUMNS = {  # of a row, at the IMU; before the last part of a name that is an a
         for axis, name in AXES.items()
     },
     "fix_delay_s": "how old fixes are at their stamp [s]",
+    "velocity_delay_s": "how much older the velocity of a fix is than its position [s]",
     "clock_drift_ppm": "receiver's clock fast against that of the IMU, per million: the delay grows so",
     "lever_forward_m": "antenna further forward than the lever arm says [m]",
     "lever_right_m": "antenna further to the right than the lever arm says [m]",

@@ -26,7 +26,7 @@ from dlkf.filters.aids.attach import aid_columns, find_kalman
 from dlkf.filters.aids.estimates import describe_estimate
 from dlkf.filters.constraints import CarConstraints
 from dlkf.filters.integration import BatchSolution, WholeLoop
-from dlkf.filters.receiver import ARM, DELAY, DRIFT
+from dlkf.filters.receiver import ARM, DELAY, DRIFT, VELOCITY_DELAY
 from dlkf.filters.smoother import Filter, SmoothedSolution
 from dlkf.navigation.compiled import without_loops
 from dlkf.running.batched import CHUNK_SAMPLES, pack, run_filter
@@ -40,7 +40,8 @@ from dlkf.running.start.entry import SLACK_S, SLOWEST_FIXES_S, SLOWEST_START_S
 FEW_DRIVES = 8  # whose start in tensor operations takes less than numba takes to load
 WORTH_SAYING = 0.01  # probability of another heading
 SIGMAS = 3.0  # what differs from what a log says by so many 1σ is worth saying
-OF_RECEIVER = {DELAY: 0.01, **dict.fromkeys(ARM, 0.1), DRIFT: 30.0}  # s, m, ppm: 1σ of what no model of a car contains
+# s, m, ppm: 1σ of what no model of a car contains
+OF_RECEIVER = {DELAY: 0.01, VELOCITY_DELAY: 0.01, **dict.fromkeys(ARM, 0.1), DRIFT: 30.0}
 SAMPLES_AT_ONCE = CHUNK_SAMPLES  # IMU samples of drives in memory, 8 h at 50 Hz
 LONG_RESTART_S = 10.0  # without rows, before the next is named
 VIBRATION = "vibration_speed"

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 from dlkf.filters.g_sensitivity import NAMES
-from dlkf.filters.receiver import ARM, DELAY, DRIFT
+from dlkf.filters.receiver import ARM, DELAY, DRIFT, VELOCITY_DELAY
 
 DEGREES, G = 180 / math.pi, 9.80665
 DIGITS = 2  # of 1σ
@@ -30,6 +30,7 @@ ESTIMATES: Mapping[str, Readable] = {
     "baro_offset_m": Readable("Barometer offset", "m"),
     "baro_wind": Readable("Barometer share of dynamic pressure", "%", 100.0),
     DELAY: Readable("Delay of fixes", "ms", 1000.0),
+    VELOCITY_DELAY: Readable("Velocity later than position", "ms", 1000.0),
     **{name: Readable(f"Antenna further {name.split('_')[1]}", "m") for name in ARM},
     DRIFT: Readable("Clock drift", "ppm"),
     **{name: Readable("g-sensitivity " + " ".join(name.split("_")[-2:]), "°/s/g", DEGREES * G) for name in NAMES},
