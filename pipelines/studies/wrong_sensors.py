@@ -5,7 +5,7 @@
 From the first on, fixes get errors that the reported 1σ does not know: positions off by 3, 1 or 30 m (1σ per axis) in
 some seconds, by one error of 3 m for ten seconds about every 50 s, by 0.3, 1 or 3 m in all, or by 1 m that wanders over
 30 s; velocities off by 5 m/s in some, by 0.5 m/s in all, or those of a second before; or the receiver extrapolates for
-five seconds about every 50 s. Or the IMU has a turn-on bias, of
+five seconds about every 50 s, or averages two positions. Or the IMU has a turn-on bias, of
 random direction, beside its own, gyroscopes whose scale factors are 1 or 3 % off, or biases that step. Or the files are
 wrong: stamps of fixes 0.1 or 0.3 s late, clocks 100 or 300 ppm apart, an antenna 1.4 m from where the lever arm says,
 one of 500 samples of a sensor spoiled.
@@ -116,6 +116,14 @@ def late(drive: Drive, g: torch.Generator) -> Drive:
     return replace(drive, gnss_v_e=v_e, gnss_valid=valid)
 
 
+def averaged(drive: Drive, g: torch.Generator) -> Drive:
+    """Positions that are the mean of this fix and the one before."""
+    r_e, fixed = drive.gnss_r_e.clone(), drive.gnss_valid[:, :3].all(-1)
+    both = (fixed[1:] & fixed[:-1]).unsqueeze(-1)
+    r_e[1:] = torch.where(both, 0.5 * (r_e[1:] + drive.gnss_r_e[:-1]), r_e[1:])
+    return replace(drive, gnss_r_e=r_e)
+
+
 def extrapolated(seconds: int) -> Change:
     """Fixes that go on from the one before with its velocity for so long, again and again."""
 
@@ -180,8 +188,9 @@ ERRORS: Mapping[str, Change] = {
     "3 % off": gyro_scale(0.03),
     "biases that step by 0.1 m/s², 0.15 °/s": bias_steps(0.1, 0.15),
     "fixes extrapolated for 5 s": extrapolated(5),
+    "positions that are means of two fixes": averaged,
 }
-OF_VELOCITIES, OF_IMU = [*[*ERRORS][9:12], [*ERRORS][-1]], [*ERRORS][12:16]
+OF_VELOCITIES, OF_IMU = [*[*ERRORS][9:12], *[*ERRORS][-2:]], [*ERRORS][12:16]  # receivers with velocities; real drives
 SPIKED = 1 / 500
 WIDE_ACCEL = {"turn_on_bias": 0.5}  # m/s², 1σ
 WIDE_GYRO = {"turn_on_bias": math.radians(2.0), "scale_factor": 0.02}
