@@ -17,7 +17,15 @@ from dlkf.filters.aids.attach import aid_columns
 from dlkf.filters.build import build_filter
 from dlkf.filters.integration import Epoch, Fix, integrate
 from dlkf.filters.receiver import (
-    ARM, DELAY, DRIFT, PPM, SLOPE_S, VELOCITY_DELAY, add_drift, let_delay_grow, predict_fix,
+    ARM,
+    DELAY,
+    DRIFT,
+    PPM,
+    SLOPE_S,
+    VELOCITY_DELAY,
+    add_drift,
+    let_delay_grow,
+    predict_fix,
 )  # fmt: skip
 from dlkf.navigation.calibration import ImuError
 from dlkf.navigation.error_model import antenna

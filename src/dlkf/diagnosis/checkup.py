@@ -179,13 +179,14 @@ def _grade_offset(finding: Finding, late: float, autos: str) -> CheckupResult:
         )
     remedy = ESTIMATED + (autos or f"reader.imu.time.offset_s={off:g}")
     if apart:
-        remedy = f"one offset does not suit both: ingest with {autos or f'reader.gnss.position.delay_s={late:g}'}"
+        both = autos or f"reader.gnss.position.delay_s={late:g}"
+        remedy = f"one offset does not suit both: {ESTIMATED}{both}"
     grade = NOTE if abs(off) < DELAY_S else BAD  # receivers are late, clocks are wrong
     return CheckupResult(grade, f"clocks: {lead} ({finding.detail}); {remedy}")
 
 
 CLOCKS = ("imu.time.offset_s", "gnss.time.drift_ppm", "gnss.position.delay_s")
-ESTIMATED = "plus and filters with +receiver estimate it; for others ingest with "
+ESTIMATED = "plus and filters with +receiver estimate this; for others ingest with "
 
 
 def measure_turn(angles: Mapping[str, float]) -> float:
