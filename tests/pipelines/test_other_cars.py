@@ -319,5 +319,5 @@ def test_the_whole_study_on_one_log(tmp_path, monkeypatch, capsys):
     assert head.startswith("| log | GNSS [s] | outage [s] | outages | mbkf33_car any_car |")
     cells = [row.split(" | ")[:4] for row in rows[:2]]
     assert cells == [["| `kingston`", "45", "30", "2"], ["| `kingston`", "45", "60", "1"]]
-    assert rows[-1] == "| 45 | 3 (1) | 1.00; 1.00 | 1.00; 1.00 |"  # the same filter
+    assert rows[-1] == "| 45 | 3 (1) | 1.00; 1.00 | 1.00; 1.00 | 1.00; 1.00 |"  # the same filter
     assert "digests" in (tmp_path / "out" / "manifest.json").read_text() and rows[0] in capsys.readouterr().out
