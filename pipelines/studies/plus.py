@@ -44,7 +44,9 @@ from dlkf.command.composing import imu_preset, tuning_preset
 from dlkf.command.simulated import compose_recipe
 from dlkf.data.alignment import ALIGN
 from dlkf.data.drive import Batch, Drive
+from dlkf.data.kinds import drive_rates
 from dlkf.data.masks import withhold_fixes
+from dlkf.data.resampling import usual_rate
 from dlkf.data.segments import StartLaw, cut_segments, make_batch, whole_drives
 from dlkf.data.stack import DriveStack
 from dlkf.data.store import dataset_digest, load_dataset
@@ -98,8 +100,9 @@ class Row:
     groups: list[str]
 
 
-def load(folder: Path, rate_hz: float = 50.0, fix_s: int = 1) -> list[Drive]:
-    """Drives of a dataset, samples averaged to ``rate_hz``, with a fix every ``fix_s`` seconds."""
+def load(folder: Path, rate_hz: float | None = None, fix_s: int = 1) -> list[Drive]:
+    """Drives of a dataset, samples averaged to ``rate_hz``, else the usual, with a fix every ``fix_s`` seconds."""
+    rate_hz = rate_hz or usual_rate(drive_rates(folder).values())
     drives = load_dataset(folder, rate_hz=rate_hz, epoch_s=1.0, dtype=torch.float64)
     return [replace(d, gnss_valid=d.gnss_valid & (torch.arange(d.epochs + 1) % fix_s == 0)[:, None]) for d in drives]
 
@@ -290,7 +293,7 @@ def main() -> None:
     arguments.add_argument("--oracle", action="store_true", help="beside a filter given the noise of simulated drives")
     arguments.add_argument("--parts", action="store_true", help="against itself without a part")
     arguments.add_argument("--model", default="plus", help="weights: plus, or a folder")
-    arguments.add_argument("--rate", type=float, default=50.0, help="of the IMU samples that the filters get [Hz]")
+    arguments.add_argument("--rate", type=float, help="of the IMU samples that the filters get [Hz], else the usual")
     arguments.add_argument("--fix-interval", type=int, default=1, help="of the fixes that the filters get [s]")
     arguments.add_argument("--train", action="store_true", help="constants and weights anew, first")
     arguments.add_argument("--out", type=Path, default=Path("outputs/plus"))

@@ -18,7 +18,7 @@ from dlkf.base.parallel import check_engine
 from dlkf.base.provenance import describe_provenance
 from dlkf.command import command, list_typed_words
 from dlkf.command.scored import EvaluateSettings
-from dlkf.data.kinds import drive_kinds
+from dlkf.data.kinds import drive_kinds, drive_rates
 from dlkf.data.store import choose_aids, dataset_digest, drive_rows
 from dlkf.evaluation.chunks import SHORT, EvaluationJob, evaluate_chunks, suggest_more_outages
 from dlkf.evaluation.outages import UNUSED, check_outages, describe_rounding, describe_unused
@@ -72,10 +72,12 @@ def evaluate_dataset(settings: EvaluateSettings, console: Console, typed: Sequen
         refuse_left_out(models, chosen)
     models = {model_name: with_aids(model, chosen) for model_name, model in models.items()}
     taken = dict.fromkeys(table for model in models.values() for table in find_tables(model))
-    step = choose_grid(models.values(), settings.rate_hz, settings.epoch_s)
-    grid = {**step, "aids": tuple(taken)}
     check_engine(settings.parallel, settings.dataset)
     rows, name = drive_rows(settings.dataset, settings.drives), folder_name(settings.dataset)
+    rates = drive_rates(settings.dataset)
+    of_rows = [rates[row.name] for row in rows if row.name in rates]
+    step = choose_grid(models.values(), settings.rate_hz, settings.epoch_s, rates=of_rows)
+    grid = {**step, "aids": tuple(taken)}
     digest, kinds = dataset_digest(settings.dataset), drive_kinds(settings.dataset)
     cards = {model_name: getattr(model, "card", {}) for model_name, model in models.items()}
     kalman = [model_name for model_name in models if is_filter(model_name) and model_name != "ins"]

@@ -20,6 +20,8 @@ from dlkf.base.provenance import describe_provenance
 from dlkf.command import command, list_typed_words
 from dlkf.command.settings import NavigateSettings
 from dlkf.data.drive import Drive
+from dlkf.data.kinds import drive_rates
+from dlkf.data.resampling import usual_rate
 from dlkf.data.store import choose_aids, dataset_digest, drive_rows, load_dataset
 from dlkf.data.tables import drive_clocks
 from dlkf.filters.aids.attach import describe_aids, find_tables, refuse_left_out, with_aids
@@ -55,8 +57,9 @@ def main(settings: NavigateSettings) -> None:
     clocks = drive_clocks(settings.dataset)
     rows, name = drive_rows(settings.dataset, settings.drives), short_name(settings.model)
     spacings = {row.name: offline.UsableFixes.of(settings.dataset, row.name) for row in rows}
-    usual = offline.choose_epoch(spacings.values(), settings.rate_hz or 50.0, model)
-    step = choose_grid([model], settings.rate_hz, settings.epoch_s, usual)
+    rates = [rate for drive, rate in drive_rates(settings.dataset).items() if drive in spacings]
+    usual = offline.choose_epoch(spacings.values(), settings.rate_hz or usual_rate(rates), model)
+    step = choose_grid([model], settings.rate_hz, settings.epoch_s, usual, rates)
     chosen = choose_aids(settings.dataset, settings.aids, settings.drives)
     if settings.aids is not None:
         refuse_left_out({name: model}, chosen)

@@ -7,6 +7,7 @@ import pandas as pd
 import pytest
 
 from dlkf.base.angles import wrap_angle
+from dlkf.data.resampling import usual_rate
 from dlkf.data.schema import ACCEL, GYRO, POSITION, STD, VELOCITY, write_drive
 from dlkf.filters.build import build_filter
 from dlkf.filters.saved import choose_grid
@@ -44,7 +45,16 @@ def test_a_row_without_a_position_is_no_usable_fix(tmp_path):
 def test_a_network_round_a_filter_with_constraints_keeps_its_second():
     plus = trained_filter("plus")
     assert choose_grid([plus]) == {"rate_hz": 50.0, "epoch_s": 1.0}
+    assert choose_grid([plus], rates=[9.98, 10.01]) == {"rate_hz": 10.0, "epoch_s": 1.0}
+    assert choose_grid([plus], 50.0, rates=[10.0])["rate_hz"] == 50.0
     assert choose_epoch([FIVE_A_SECOND], 50.0, plus) == 1.0
+
+
+def test_the_grid_of_slow_logs_has_their_own_rate():
+    """That of the fastest, in whole samples an update interval; 50 Hz for logs at 40 Hz and more, and for none."""
+    assert [usual_rate(x) for x in ([], [100.0], [39.9, 100.0], [40.0])] == [50.0] * 4
+    assert [usual_rate(x) for x in ([9.97, 4.0], [25.3], [0.4])] == [10.0, 25.0, 1.0]
+    assert usual_rate([9.97], 0.25) == 8.0
 
 
 def driven(seed: int) -> TrackOnMap:

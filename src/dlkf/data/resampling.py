@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,6 +28,7 @@ FARTHEST = 2**62  # boundary: where stamps beyond any clock are put
 # horizontal position [m] and velocity [m/s] 1σ where a source gives none, by NMEA GGA quality
 DEFAULT_STD = {4: (0.02, 0.05), 5: (0.3, 0.1), 2: (1.0, 0.1), 3: (1.0, 0.1), 9: (1.0, 0.1), 1: (2.5, 0.2)}
 VERTICAL_FACTOR = 1.5  # of the default position std
+USUAL_HZ, SLOW_HZ = 50.0, 40.0  # of the grid; of logs that have a grid of their own
 FASTEST_HZ, LONGEST_S = 10_000.0, 60.0  # of an IMU, of an epoch: beyond these something was mistyped
 
 
@@ -72,6 +74,17 @@ def check_rate(rate_hz: float | None, epoch_s: float | None) -> None:
     for name, given, most in (("rate_hz", rate_hz, FASTEST_HZ), ("epoch_s", epoch_s, LONGEST_S)):
         if given is not None and not 0 < given <= most:
             raise InputError(f"{name} is {given!r}, must be above 0 and at most {most:g}")
+
+
+def usual_rate(rates: Iterable[float], epoch_s: float = 1.0) -> float:
+    """Samples a second of the grid for logs with so many [Hz]: 50, or where all are slower than 40 Hz as many as the
+    fastest, in whole ones an epoch.
+
+    A sample that is held over several of the grid has images of its spectrum beyond half its own rate, which speed from
+    vibration (up to 20 Hz) would take for the car's.
+    """
+    fastest = max(rates, default=USUAL_HZ)
+    return USUAL_HZ if fastest >= SLOW_HZ else max(1, round(fastest * epoch_s)) / epoch_s
 
 
 def samples_per_epoch(rate_hz: float, epoch_s: float) -> int:

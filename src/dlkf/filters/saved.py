@@ -12,7 +12,7 @@ from safetensors.torch import load_file, save_file
 
 from dlkf.base.documents import read_yaml
 from dlkf.base.errors import InputError
-from dlkf.data.resampling import check_rate
+from dlkf.data.resampling import check_rate, usual_rate
 from dlkf.filters.card import CARD, read_card
 from dlkf.filters.learned import LearnedConfig, LearnedFilter
 from dlkf.filters.learned_kalman import LearnedKalmanConfig, LearnedKalmanFilter
@@ -56,14 +56,17 @@ def choose_grid(
     rate_hz: int | float | None = None,
     epoch_s: int | float | None = None,
     usual_epoch_s: int | float = 1.0,
+    rates: Iterable[float] = (),
 ) -> dict[str, Any]:
-    """``rate_hz`` and ``epoch_s``: as given, else what a trained filter was trained on, else 50 Hz and the usual.
+    """``rate_hz`` and ``epoch_s``: as given, else what a trained filter was trained on, else the usual for logs with
+    ``rates`` samples a second (:func:`dlkf.data.resampling.usual_rate`) and ``usual_epoch_s``.
 
     Raises InputError where one of them is not above 0, or beyond what there is.
     """
     configs: list[Any] = [getattr(m, "config", None) for m in models]
-    own = next(((c.rate_hz, c.epoch_s) for c in configs if hasattr(c, "rate_hz")), (50.0, usual_epoch_s))
     check_rate(rate_hz, epoch_s)
+    usual = usual_rate(rates, usual_epoch_s if epoch_s is None else epoch_s), usual_epoch_s
+    own = next(((c.rate_hz, c.epoch_s) for c in configs if hasattr(c, "rate_hz")), usual)
     return {"rate_hz": own[0] if rate_hz is None else rate_hz, "epoch_s": own[1] if epoch_s is None else epoch_s}
 
 

@@ -99,6 +99,7 @@ def navigate(
 
     from dlkf.data.alignment import read_align
     from dlkf.data.kinds import drive_rates
+    from dlkf.data.resampling import usual_rate
     from dlkf.data.store import choose_aids, load_dataset
     from dlkf.filters.aids.attach import describe_aids, find_tables, with_aids
     from dlkf.filters.card import describe_slow_drives
@@ -119,11 +120,13 @@ def navigate(
         estimator = with_aids(load(model, imu_type=imu_type, tuning=tuning, prior=prior), chosen)
         named = {short_name(model): estimator}
         unused = describe_aids(named, [t for t in chosen if t not in find_tables(estimator)])
-        slow = describe_slow_drives(named, drive_rates(folder).values(), "this drive has")
+        rates = [*drive_rates(folder).values()]
+        slow = describe_slow_drives(named, rates, "this drive has")
         if smoothed:
             estimator = run_smoother(estimator, "rts")
         fixes = UsableFixes.of(folder, DRIVE)
-        grid = choose_grid([estimator], rate_hz, epoch_s, choose_epoch([fixes], rate_hz or 50.0, estimator))
+        usual = choose_epoch([fixes], rate_hz or usual_rate(rates), estimator)
+        grid = choose_grid([estimator], rate_hz, epoch_s, usual, rates)
         drives = load_dataset(folder, dtype=torch.float64, reference=False, aids=find_tables(estimator), **grid)
         (navigated,) = navigate_drives(drives, estimator, align=read_align())
     solution = Solution.of(navigated, fixes, short_name(model), REMEDY if takes_tuning(model) else OF_NETWORK)

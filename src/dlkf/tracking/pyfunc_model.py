@@ -48,8 +48,10 @@ class NavigationFilter(PythonModel):
 
     def _load_drives(self, given: pd.DataFrame, params: dict[str, Any]) -> Iterator[tuple[str, list, Any]]:
         """A folder, its drives, and the filter with the sensors that they have; of a table no folder."""
+        import numpy as np
         import torch
 
+        from dlkf.data.kinds import drive_rates
         from dlkf.data.rows import split_drives
         from dlkf.data.store import choose_aids, drive_from_tables, drive_rows, load_dataset
         from dlkf.filters.aids.attach import find_tables, with_aids
@@ -57,22 +59,26 @@ class NavigationFilter(PythonModel):
 
         if "dataset" in given and given["dataset"].notna().any():
             for folder in given["dataset"].dropna().explode():  # MLflow puts a list of words into one cell
-                grid = self._choose_grid([UsableFixes.of(folder, row.name) for row in drive_rows(folder)])
+                rates = [*drive_rates(folder).values()]
+                grid = self._choose_grid([UsableFixes.of(folder, row.name) for row in drive_rows(folder)], rates)
                 estimator = with_aids(self.filter, choose_aids(folder, None))
                 options = {**grid, "reference": False, "aids": find_tables(estimator)}
                 yield folder, load_dataset(folder, dtype=torch.float64, **options), estimator
             return
         arm = [float(params.get(f"lever_arm_{a}_m", 0.0)) for a in "xyz"]
         tables = list(split_drives(given, arm))
-        grid = self._choose_grid([UsableFixes.among(t.gnss) for t in tables])
+        rates = [1 / float(np.median(np.diff(t.imu["t"]))) for t in tables]
+        grid = self._choose_grid([UsableFixes.among(t.gnss) for t in tables], rates)
         yield "", [drive_from_tables(t, "", **grid, dtype=torch.float64) for t in tables], self.filter
 
-    def _choose_grid(self, fixes: list) -> dict[str, Any]:
+    def _choose_grid(self, fixes: list, rates: list) -> dict[str, Any]:
         """As ``dlkf navigate`` does where nothing is set."""
+        from dlkf.data.resampling import usual_rate
         from dlkf.filters.saved import choose_grid
         from dlkf.running.offline import choose_epoch
 
-        return choose_grid([self.filter], usual_epoch_s=choose_epoch(fixes, 50.0, self.filter))
+        usual = choose_epoch(fixes, usual_rate(rates), self.filter)
+        return choose_grid([self.filter], usual_epoch_s=usual, rates=rates)
 
 
 set_model(NavigationFilter())
