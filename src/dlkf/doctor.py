@@ -26,7 +26,8 @@ def main(settings: DoctorSettings) -> None:
         for finding in checkup(settings.dataset, row):
             console.print(Text(f"  {finding.grade:5}", style=STYLES[finding.grade]) + Text(f" {finding.text}"))
             bad, noted = bad + (finding.grade == "BAD"), noted + (finding.grade not in (GOOD, "BAD"))
-    console.print(f"{bad} failed, {noted} notes" if bad or noted else "all good")
+    notes = f"{noted} note{'s' if noted != 1 else ''}"
+    console.print(f"{bad} failed, {notes}" if bad or noted else "all good")
     if bad:
         sys.exit(1)
 

@@ -103,7 +103,10 @@ def main(settings: NavigateSettings) -> None:
         done = parallel_map(partial(offline.load_chunk, run, skipped is not None), shares, settings.parallel)
         navigated = partial(offline.navigate_chunks, done, len(rows), skipped=skipped)
     lines, courses = [], []
-    shown = f"{name} (imu={preset})" if "imu" in list_settings_taken(settings.model) else name
+    taken = list_settings_taken(settings.model)
+    shown = f"{name} (imu={preset})" if "imu" in taken else name
+    if settings.smoother is not None and not name.endswith("_rts"):
+        name, shown = f"{name}, smoothed", f"{shown}, smoothed"
     with write_into(settings.out) as folder, show_progress("Navigating") as progress:
         for result in navigated(progress=progress):
             write_solution(folder / f"drive={result.drive}" / "solution.parquet", result.table)
@@ -117,7 +120,7 @@ def main(settings: NavigateSettings) -> None:
         made = {
             **describe_provenance(), "model": settings.model, "dataset": settings.dataset, "drives": settings.drives,
             **step, "aids": [table.name for table in grid["aids"]], "digest": dataset_digest(settings.dataset),
-            "imu": asdict(spec), "tuning": tuning.factors(),
+            **{key: value for key, value in (("imu", asdict(spec)), ("tuning", tuning.factors())) if key in taken},
         }  # fmt: skip
         remedy = REMEDY if takes_tuning(settings.model) else OF_NETWORK
         doubt = offline.sigma_warning((course.result for course in courses), name, remedy)

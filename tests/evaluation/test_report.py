@@ -77,6 +77,9 @@ def test_tables_hold_the_summarise_scores(scores):
     assert few.startswith(f"20 s without GNSS, 6 outages: mbkf15 ends {at_end[0]} m from the reference in the median (")
     assert f" % of the distance driven), {at_end[1]} m in the largest; next ins " in few
     assert few.endswith(" Based on 6 outages only; larger errors can occur.")
+    names = {"mbkf15": "mbkf15_rts", "ins": "ins"}
+    smoothed = headline(replace(r, values=[v._replace(filter=names[v.filter]) for v in r.values]))
+    assert ": ins ends " in smoothed and f"smallest: mbkf15_rts {at_end[0]} m" in smoothed
     many, one = (replace(r, count={**r.count, "outages": n}) for n in (20, 1))
     assert f" % of the distance driven), within {at_end[2]} m in 95 % of them; " in headline(many)
     assert headline(one).startswith(f"20 s without GNSS, 1 outage: mbkf15 ends {at_end[0]} m from the reference (")
@@ -338,7 +341,7 @@ def test_the_average_over_time_says_over_what_and_whether_anything_is_grey(score
     assert describe_average(scores) == f"RMS over {count} segments; grey where most of them have an outage."
     twice = replace(scores, segments=scores.segments * 2, outage=np.concatenate((scores.outage, ~scores.outage)))
     said = (
-        f"RMS over {2 * count} runs ({count} drives, each with its outages at 2 offsets); grey where most of them have"
+        f"RMS over {2 * count} runs ({count} drives, each with outages at 2 offsets); grey where most of them have"
     )
     assert describe_average(twice) == f"{said} an outage (here nowhere)."
     assert describe_average(replace(scores, outage=scores.outage & False)) == f"RMS over {count} segments."

@@ -96,6 +96,16 @@ def test_normalised_errors_lie_in_the_chi_square_band():
         assert torch.linalg.eigvalsh(P).min() > 0 and (P - P.mT).abs().max() == 0
 
 
+def test_an_ins_gets_a_velocity_that_a_fix_lacks_from_its_positions():
+    """From two of them, of a start with a wrong velocity; then it is that of the car but for what attitude does."""
+    batch = scene(2, 20, seed=5)
+    valid = batch.gnss_valid & (torch.arange(6) < 3)
+    wrong = batch.start._replace(v_n=batch.start.v_n + 5.0)
+    alone = integrate(replace(batch, gnss_valid=valid, start=wrong), Ins())
+    off = (alone.posterior.v_n - batch.truth.v_n).norm(dim=-1)
+    assert float(off[:, :1].min()) > 0.05 and float(off[:, 1:].max()) < 1.0
+
+
 def test_filter_finds_the_biases_and_beats_pure_inertial():
     batch = hidden(scene(20, 90, seed=2), 60, 90)
     filtered, inertial = integrate(batch, Mbkf(IMU)), integrate(batch, Ins())

@@ -63,7 +63,9 @@ def convert_value(hint: Any, value: Any, where: str) -> Any:
             return int(value) if option is int else value
     wanted = " or ".join(dict.fromkeys(_describe_type(option) for option in options))
     remedy = ""
-    if str in options and is_number(value):
+    if is_number(value) and any(_is_list(option) and str not in get_args(option) for option in options):
+        remedy = f"; such as {where}=[{value:g},0,0]"
+    elif str in options and is_number(value):
         remedy = f"; as a name: \"{where}='{value}'\""
     elif str in options and isinstance(value, (list, tuple)):
         remedy = f"; one at a time, or -m {where}={','.join(map(str, value))} for a run each"

@@ -193,6 +193,8 @@ def with_near_key(line: str, command: str) -> str:
     from dlkf.command.composing import compose_command
 
     key, rest = unknown[1], line[unknown.end() :]
+    if (command, key) == ("evaluate", "smoother"):
+        return f"{line[: unknown.end()]}smoother belongs to navigate; a smoothed filter here is model=<filter>_rts"
     if (config_dir() / key).is_dir():
         return f"{line[: unknown.end()]}a preset is chosen with a plus: +{key}=…; {rest}"
     known = list(_paths(compose_command(command, resolve=False)))

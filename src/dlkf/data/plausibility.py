@@ -176,7 +176,8 @@ def _check_way(gnss: Columns, where: str) -> None:
     if given < SUSPECT:
         return
     readings = {
-        "latitude and longitude look swapped; exchange lat_deg and lon_deg": (lon, lat, moved),
+        "latitude and longitude look swapped; exchange the first two of reader.gnss.position.columns, or lat_deg and "
+        "lon_deg": (lon, lat, moved),
         "lat_deg and lon_deg look like radians (unit=rad), or like degrees that were read as ddmm (unit=deg); "
         "reader.gnss.position.unit=…, or give degrees": (np.degrees(lat), np.degrees(lon), moved),
         "vel_n and vel_e look swapped; reader.gnss.velocity.frame=enu, or exchange them": (lat, lon, moved[:, ::-1]),

@@ -105,8 +105,8 @@ def suggest_more_outages(
     drives = sum(parallel_map(partial(count_outages, whole), chunks, parallel))
     if drives > count:
         return f"Few outages ({count}); mode=drives scores whole drives and has {drives}."
-    smaller = "a smaller outage.duration_s or outage.first_s"
-    return f"Few outages ({count}), and mode=drives has no more ({drives}); with {smaller} it has."
+    smaller = "a smaller outage.duration_s or outage.first_s gives more"
+    return f"Few outages: {count}, and {drives} with mode=drives; {smaller}."
 
 
 def count_outages(work: EvaluationJob, names: tuple[str, ...]) -> int:

@@ -40,10 +40,8 @@ class OutagePlan:
     offsets_s: Sequence[float] | None = None
 
     def __post_init__(self) -> None:
-        low, high = bounds("outage.duration_s", self.duration_s)
+        _, high = bounds("outage.duration_s", self.duration_s, positive=True)
         bounds("outage.first_s", self.first_s)
-        if low <= 0:
-            raise InputError(f"outage.duration_s is {low:g} s, must be above 0")
         if min(self.offsets_s or (0.0,)) < 0:
             raise InputError("outage.offsets_s must be a list of numbers ≥ 0, such as [0]")
         if self.every_s is not None and self.every_s <= high:
@@ -158,13 +156,14 @@ def check_outages(plan: OutagePlan | None, withheld: Tensor | np.ndarray, longes
         )
 
 
-def bounds(name: str, value: float | Sequence[float]) -> tuple[float, float]:
-    """Least and greatest of a number or (low, high); InputError for what is neither."""
+def bounds(name: str, value: float | Sequence[float], positive: bool = False) -> tuple[float, float]:
+    """Least and greatest of a number or (low, high), ≥ 0 or > 0; InputError for what is neither."""
     values = [value] if isinstance(value, (int, float)) else list(value)
-    if len(values) not in (1, 2) or not np.isfinite(values).all() or min(values) < 0 or values[0] > values[-1]:
+    wrong = len(values) not in (1, 2) or not np.isfinite(values).all() or values[0] > values[-1]
+    if wrong or min(values) < 0 or (positive and min(values) == 0):
         several = f"; for a run each -m {name}={','.join(f'{x:g}' for x in values)}" if len(values) > 2 else ""
-        given = values if len(values) > 1 else values[0]
-        raise InputError(f"{name} is {given}, must be a number ≥ 0 or [low, high] in seconds{several}")
+        given, least = values if len(values) > 1 else values[0], "> 0" if positive else "≥ 0"
+        raise InputError(f"{name} is {given}, must be a number {least} or [low, high] in seconds{several}")
     return float(values[0]), float(values[-1])
 
 

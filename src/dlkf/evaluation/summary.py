@@ -49,8 +49,9 @@ def headline(result: Results) -> str:
 
     "60 s without GNSS, 40 outages: plus ends 8.8 m from the reference in the median (1.4 % of the distance driven),
     within 33 m in 95 % of them; best classical filter mbkf21_car 10 m, 41 m." The best has the least median. Of fewer
-    than :data:`FEW` outages the largest error takes the place of the 95 %, with a warning. Without outages the
-    horizontal error over the settled part of the segments, with the longest time without a fix unless it is short.
+    than :data:`FEW` outages the largest error takes the place of the 95 %, with a warning. A smoothed filter comes
+    last: its errors are largest within the outage. Without outages the horizontal error over the settled part of the
+    segments, with the longest time without a fix unless it is short.
     """
     span = result.count["outage_s"]
     where = END if span else SETTLED
@@ -61,7 +62,9 @@ def headline(result: Results) -> str:
     order = sorted((n for n in errors if not math.isnan(errors[n][0])), key=lambda n: errors[n][0])
     if not order:
         return "No filter could be scored: there is no valid reference where it counts."
-    best, texts = order[0], {n: [f"{format_number(x)} m" for x in errors[n]] for n in order}
+    smoothed = [n for n in order if n.endswith("_rts")]
+    order = [n for n in order if n not in smoothed] or order
+    best, texts = order[0], {n: [f"{format_number(x)} m" for x in errors[n]] for n in errors}
     gap = result.count.get("longest_without_fix_s", math.inf)
     own = "With GNSS throughout" if gap <= THROUGHOUT_S else "With all fixes of the drives"
     own += f", at most {gap:.3g} s without one" if THROUGHOUT_S < gap < math.inf else ""
@@ -74,6 +77,9 @@ def headline(result: Results) -> str:
     if other is not None:
         which = "next" if is_filter(best) else "best classical filter"
         text += f"; {which} {other} {', '.join(texts[other])}"
+    if span and smoothed:
+        size = "" if best in smoothed else f": {smoothed[0]} {', '.join(texts[smoothed[0]])}"
+        text += f"; smoothed with the fixes after it, where its errors are smallest{size}"
     few = f" Based on {count} {unit}{'s' if count > 1 else ''} only; larger errors can occur." if count < FEW else ""
     return f"{text}.{few}"
 

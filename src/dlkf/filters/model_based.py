@@ -33,24 +33,36 @@ from dlkf.navigation.state import GYRO, PVA, STATES, ErrorStates
 GENERIC_IMU = ImuSpec("any", SensorErrors(), SensorErrors())
 
 
+class InsMemory(NamedTuple):
+    """How long the INS has run by itself."""
+
+    since_fix_s: Tensor  # (B,) s since the last position, or the start
+
+
 @dataclass(frozen=True)
 class Ins:
     """Inertial navigation from the last fix (R012): the raw IMU is used, and no error of it is estimated.
 
-    A fix sets position and velocity, so that an outage begins where those of the Kalman filters begin; attitude runs
+    A fix sets position and velocity, so that an outage begins where those of the Kalman filters begin; a velocity that
+    it lacks is corrected by the innovation of the position over the time since the last one. Attitude runs
     from the start, for nothing corrects it. ``free``: nothing is set, pure strapdown from the start.
     """
 
     free: bool = False
 
-    def begin(self, batch: Batch) -> tuple[None, Tensor]:
-        """No memory; the raw IMU is used."""
-        return None, batch.imu.new_zeros(batch.size[0], 6)
+    def begin(self, batch: Batch) -> tuple[InsMemory, Tensor]:
+        """At the start, with the raw IMU."""
+        return InsMemory(batch.imu.new_zeros(batch.size[0])), batch.imu.new_zeros(batch.size[0], 6)
 
-    def step(self, memory: None, epoch: Epoch) -> tuple[None, Correction]:
+    def step(self, memory: InsMemory, epoch: Epoch) -> tuple[InsMemory, Correction]:
         """The innovation itself, of the components of the fix."""
-        dx = torch.nn.functional.pad(torch.zeros_like(epoch.z) if self.free else epoch.z, (0, 3))
-        return None, Correction(dx, epoch.error)
+        if self.free:
+            return memory, Correction(epoch.z.new_zeros(len(epoch.z), 9), epoch.error)
+        p, v = epoch.z.split(3, -1)
+        since = memory.since_fix_s + epoch.span_s
+        v = torch.where(epoch.used[:, 3:], v, p / since.unsqueeze(-1))
+        memory = InsMemory(torch.where(epoch.used[:, :3].any(-1), 0.0, since))
+        return memory, Correction(torch.cat((p, v, torch.zeros_like(p)), -1), epoch.error)
 
 
 class KalmanMemory(NamedTuple):

@@ -53,6 +53,7 @@ MEMORY = {  # by the last parts of a field's name
     "error.g_sensitivity": "rate that gyroscopes show of specific force forward and right [rad/s per m/s²]",
     "error.matrix": "scale factors, or M of measured = (I + M) true + bias",
     "lever_arm_b": "IMU to antenna, forward, right, down [m]",
+    "since_fix_s": "time since the last position [s]",
     "P": "covariance of the error states: m, m/s, rad, m/s², rad/s, then elements of M, then the car",
     "still": "transition of a window in which nothing moves",
     "density": "S of the noise: accelerometers [m²/s³], gyroscopes [rad²/s], walks of their biases [m²/s⁵, rad²/s³]",

@@ -217,8 +217,9 @@ def describe_average(scores: Scores) -> str:
     count, sources = len(scores.segments), len({(s.drive, s.t_start) for s in scores.segments})
     text = f"RMS over {count} segments"
     if sources < count:
-        what = "drives" if sources == len({s.drive for s in scores.segments}) else "segments"
-        text = f"RMS over {count} runs ({sources} {what}, each with its outages at {count / sources:.2g} offsets)"
+        what = "drive" if sources == len({s.drive for s in scores.segments}) else "segment"
+        each = f"{sources} {what}{'s, each' if sources > 1 else ''} with outages at {count / sources:.2g} offsets"
+        text = f"RMS over {count} runs ({each})"
     if not scores.outage.any():
         return f"{text}."
     return f"{text}; grey where most of them have an outage{'' if _mostly_hidden(scores).any() else ' (here nowhere)'}."

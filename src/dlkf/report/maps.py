@@ -120,7 +120,7 @@ def chart(
         meta={"areas": views, "first": first},
         map={"style": "white-bg", "center": centre, "zoom": zoom(views[first])}, height=520, font=FONT,
         margin={"l": 0, "r": 0, "t": 40 if groups else 5, "b": 0},
-        legend={"orientation": "h", "yanchor": "top", "y": -0.02},
+        legend={"orientation": "h", "yanchor": "top", "y": -0.02}, showlegend=True,
     )  # fmt: skip
     names = list(dict.fromkeys(g for g in groups if g))
     if len(names) > 1:

@@ -25,7 +25,7 @@ from torch import Tensor
 
 from dlkf.filters.learned import LearnedMemory
 from dlkf.filters.learned_kalman import LearnedKalmanMemory
-from dlkf.filters.model_based import KalmanMemory
+from dlkf.filters.model_based import InsMemory, KalmanMemory
 from dlkf.filters.plus import PlusMemory
 from dlkf.filters.stationarity import LastSecond, PositionSpan, Rest
 from dlkf.filters.vibration_speed import VibrationMemory
@@ -127,6 +127,7 @@ def _bridge_plus(stretch: Stretch, memory: PlusMemory, fresh: PlusMemory) -> Plu
 
 
 RULES: Rules = {
+    InsMemory: {"since_fix_s": Stretch.time},
     KalmanMemory: {"P": Stretch.covariance},
     PositionSpan: begin_anew,
     LastSecond: begin_anew,

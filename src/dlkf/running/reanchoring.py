@@ -21,7 +21,7 @@ from dlkf.filters.fix_noise import FixNoise
 from dlkf.filters.gating import CoarseMemory, GateMemory
 from dlkf.filters.learned import LearnedMemory
 from dlkf.filters.learned_kalman import LearnedKalmanMemory
-from dlkf.filters.model_based import KalmanMemory
+from dlkf.filters.model_based import InsMemory, KalmanMemory
 from dlkf.filters.plus import PlusMemory
 from dlkf.filters.position_errors import PositionErrors
 from dlkf.filters.stationarity import PositionSpan
@@ -91,6 +91,7 @@ def frame_at(state: NavState, frame: TangentFrame) -> TangentFrame:
 
 
 RULES: Rules = {
+    InsMemory: {},
     KalmanMemory: {"P": FrameChange.covariance},
     WindowModel: lambda change, old, fresh: replace(fresh, density=old.density),
     AdaptiveNoise: {"Q": FrameChange.covariance, "R": FrameChange.variances},

@@ -15,7 +15,7 @@ from dlkf.filters.build import OWN_SOURCE, build_filter, describe_filters, filte
 from dlkf.filters.integration import Estimator
 from dlkf.filters.saved import CONFIG, WEIGHTS, load_filter
 from dlkf.filters.shipped import KNOWN_IMU, build_plus, shipped_folder
-from dlkf.filters.smoother import Filter
+from dlkf.filters.smoother import Filter, run_smoother
 from dlkf.filters.tuning import Prior, Tuning
 from dlkf.navigation.imu_errors import ImuSpec
 from dlkf.tracking.runs import RUN_ID
@@ -43,6 +43,9 @@ def resolve_model(
         raise InputError("model= is empty; give a name such as plus, or a folder")
     if is_filter(spec):
         return build_filter(spec, imu, tuning=tuning, prior=prior)
+    if spec.endswith("_rts") and not Path(spec).expanduser().exists():
+        causal = resolve_model(spec.removesuffix("_rts"), imu, tracking_uri, tuning=tuning, prior=prior)
+        return run_smoother(causal, "rts")
     if OWN_SOURCE.fullmatch(spec):
         return own_filter(spec, imu)
     if spec == KNOWN_IMU:
@@ -78,7 +81,7 @@ def list_settings_taken(spec: str) -> tuple[str, ...]:
     """Which of ``imu`` and ``tuning`` have an effect on a model: a trained filter has its own noise."""
     if is_filter(spec) or OWN_SOURCE.fullmatch(spec):
         return ("imu", "tuning")
-    return ("imu",) if spec == KNOWN_IMU else ()
+    return ("imu",) if spec.removesuffix("_rts") == KNOWN_IMU else ()
 
 
 def takes_tuning(spec: str) -> bool:
@@ -134,7 +137,8 @@ def short_name(spec: str) -> str:
 
     The folder ``best`` of a training is called after the training.
     """
-    if is_filter(spec) or shipped_folder(spec) or spec == KNOWN_IMU:
+    causal = spec.removesuffix("_rts")
+    if is_filter(spec) or shipped_folder(causal) or causal == KNOWN_IMU:
         return spec
     if RUN_ID.fullmatch(spec):
         return spec[:8]

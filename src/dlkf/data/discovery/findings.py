@@ -181,7 +181,7 @@ def _offset(lag: Lag | None, pose: Pose | None, wanted: set[str], sure: Sure, be
     """The offset of the first fix, ``before_s`` before the middle that the pose's lag is of."""
     setting = "gnss.time.offset_s" if "gnss.time.offset_s" in wanted else "imu.time.offset_s"
     sign = 1.0 if setting.startswith("gnss") else -1.0
-    if lag is None:
+    if lag is None or lag.gain <= 0.0:
         return Finding(setting, None, False, "too little motion in the time that both logs have")
     peak = (
         f"turns agree to {lag.yaw:.2f}, accelerations to {lag.force:.2f}, of 1; the next best offset fits "
