@@ -85,12 +85,14 @@ def add_track(place: Array, name: str, colour: str, *, width: float, **more: Any
 
 
 def dots(
-    place: Array, name: str, colour: str | Array, *, size: float = 6, bar: str | None = None, **more: Any
-) -> Trace:
-    """Points (n, 2) of one colour, or coloured by a value with a bar."""
+    place: Array, name: str, colour: str | Array, *, size: float = 6, bar: str | None = None,
+    ticks: Mapping[float, str] = MappingProxyType({}), **more: Any,
+) -> Trace:  # fmt: skip
+    """Points (n, 2) of one colour, or coloured by a value with a bar, which has ``ticks`` (value → text) if given."""
     marker: dict[str, Any] = {"size": size, "color": colour}
     if bar is not None:
-        marker |= {"colorscale": "Viridis", "colorbar": {"title": {"text": bar}, "thickness": 12, "len": 0.7}}
+        at = {"tickvals": list(ticks), "ticktext": list(ticks.values())} if ticks else {}
+        marker |= {"colorscale": "Viridis", "colorbar": {"title": {"text": bar}, "thickness": 12, "len": 0.7, **at}}
     return _trace(place, name, mode="markers", marker=marker, **more)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -25,6 +26,7 @@ GAP_S = 3.0  # longer without a fix is an outage
 STANDING = 0.15  # m/s
 SHARE, SHOWS = "vibration_speed_share", 0.1  # a column of the solution, and from where on vibration shows a speed
 R2D = 180 / np.pi
+STEPS = tuple(m * 10.0**e for e in range(-3, 5) for m in (1, 2, 5))  # m, of a colour bar
 WORDS = {"speed": "Wheel speed", "baro": "Barometer"}  # of sensors; of others their name
 SIGNS = (
     "Innovation / σ is expected to be 1; where most updates are refused, see the unit, sign and clock of the sensor. "
@@ -70,7 +72,7 @@ def navigation_page(
     )
     columns, rows = sensor_rows([course.result for course in courses])
     if columns:
-        page.heading("Further sensors", "Updates that used them; estimates ± 1σ at the end of the drive.")
+        page.heading("Sensors and receiver", "Updates that used a sensor; estimates ± 1σ at the end of the drive.")
         page.table(columns, rows, tall=len(courses) > 15)
         page.note(SIGNS)
     for k, course in enumerate(courses[:MOST_DRIVES]):
@@ -173,7 +175,9 @@ def route_map(courses: Sequence[TrackOnMap]) -> Figure:
         place = np.concatenate([_place(c)[i] for c, i in zip(courses, index)])
         value = np.log10(np.maximum(np.nan_to_num(sigma, nan=1e-3), 1e-3))
         label = [f"{s:.2g} m" for s in sigma]
-        add(dots(place, "horizontal 1σ", value.astype(np.float32), size=5, bar="log₁₀ 1σ [m]", text=label), "1σ")
+        ticks = {math.log10(x): f"{x:g}" for x in STEPS if value.min() - 0.1 < math.log10(x) < value.max() + 0.1}
+        of_sigma = {"bar": "1σ [m]", "ticks": ticks, "text": label}
+        add(dots(place, "horizontal 1σ", value.astype(np.float32), size=5, **of_sigma), "1σ")
     return chart(traces, {c.result.drive: _place(c) for c in courses}, groups)
 
 

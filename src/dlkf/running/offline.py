@@ -123,7 +123,7 @@ class Navigated:
         first, last, used = self.table.t.iloc[0], self.table.iloc[-1], int(self.table.gnss_used.sum())
         text = f"{self.drive}: solution from t = {round(first, 1) + 0.0:.1f} s, "
         if spacing is not None and spacing.between(-np.inf, self.aligned_at - EARLY_S):
-            text += f"none for the {int((spacing.t < first - 1e-3).sum())} fixes before, "
+            text += f"none for the {int((spacing.t < first - 1e-3).sum())} fixes before, while it aligned, "
         if self.doubt > WORTH_SAYING:
             text += f"heading ambiguous (the alternatives have probability {self.doubt:.2g}), "
         text += f"{len(self.table)} epochs, "
@@ -139,7 +139,11 @@ class Navigated:
             text += f", final 1σ {position:.2g} m horizontal, {np.degrees(last.std_yaw):.2g}° heading"
         if self.innovation is not None and np.isfinite(spread := self.innovation.normalised_rms):
             text += f", normalised innovation RMS {spread:.2g} (expected 1)"
-        text += "".join(f", {found}" for found in self.sensors().values())
+        said = self.sensors()
+        estimates = [name for name in said if f"std_{name}" in self.table]
+        text += "".join(f", {said[name]}" for name in said if name not in estimates)
+        if estimates:
+            text += f", at the end {', '.join(said[name] for name in estimates)}"
         if any(self.refused):
             text += f", rejected as implausible: {self.refused}"
         if self.restarts:
