@@ -180,6 +180,8 @@ def read_first_stamps(folder: str | Path, drive: str) -> np.ndarray:
     """The first 1000 ``t`` [s] of a drive's IMU, without reading the rest; none of one that is missing or damaged."""
     try:
         part = min((resolve_place(folder) / "imu" / f"drive={drive}").glob("*.parquet"))
+        if not part.is_file():
+            return np.empty(0)
         rows = next(pq.ParquetFile(open_parquet(part)).iter_batches(1000, columns=["t"]))
         return np.asarray(rows["t"].to_numpy(zero_copy_only=False), float)
     except (ValueError, KeyError, StopIteration, pa.ArrowException, OSError):

@@ -43,7 +43,7 @@ class Receiver(SensorSource):
 
     parameters: ClassVar[Mapping[str, Parameter]] = {
         DELAY: Parameter(std=0.05, walk=1e-4, largest=0.9),
-        VELOCITY_DELAY: Parameter(std=0.2, largest=1.0),
+        VELOCITY_DELAY: Parameter(std=0.1, largest=1.0),
         **{name: Parameter(std=0.2, largest=2.0) for name in ARM},
         DRIFT: Parameter(std=100.0, walk=0.1, largest=1000.0),
     }
