@@ -64,6 +64,8 @@ def read_drives(folder: str | Path) -> list[DriveRow]:
             raise InputError(f"dataset {folder}: is a file; give its folder, {folder.parent}")
         beside = () if is_url(str(folder)) else folder.parent.glob("*/")
         near = did_you_mean(folder.name, [p.name for p in beside]) or "; make one with dlkf.simulate or dlkf.ingest"
+        if folder.parent != Path("."):
+            near = near.replace("did you mean ", f"did you mean {folder.parent}/")
         raise InputError(f"dataset {folder}: no such folder{near}")
     if not whole:
         raise InputError(f"dataset {folder}: drives.parquet is missing; {_find_dataset(folder)}")

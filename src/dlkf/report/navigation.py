@@ -30,7 +30,8 @@ STEPS = tuple(m * 10.0**e for e in range(-3, 5) for m in (1, 2, 5))  # m, of a c
 WORDS = {"speed": "Wheel speed", "baro": "Barometer"}  # of sensors; of others their name
 SIGNS = (
     "Innovation / σ is expected to be 1; where most updates are refused, see the unit, sign and clock of the sensor. "
-    "Positive are a wheel that reads too much or comes late, and fixes whose stamps are late."
+    "Positive are a wheel that reads too much or comes late, fixes whose stamps are late, a receiver's clock that is "
+    "fast against the IMU's. All hold at the end of the drive: with such a clock the delay grows."
 )
 
 

@@ -32,7 +32,7 @@ ESTIMATES: Mapping[str, Readable] = {
     DELAY: Readable("Delay of fixes", "ms", 1000.0),
     VELOCITY_DELAY: Readable("Velocity later than position", "ms", 1000.0),
     **{name: Readable(f"Antenna further {name.split('_')[1]}", "m") for name in ARM},
-    DRIFT: Readable("Clock drift", "ppm"),
+    DRIFT: Readable("Receiver's clock fast by", "ppm"),
     **{name: Readable("g-sensitivity " + " ".join(name.split("_")[-2:]), "°/s/g", DEGREES * G) for name in NAMES},
 }
 
