@@ -50,7 +50,11 @@ AXES = tuple(f"{sensor}_{axis}" for sensor in ("accel", "gyro") for axis in "xyz
 TRIADS = ("accel", "gyro")
 NAMES = {"accel": "Accelerometers", "gyro": "Gyroscopes"}
 UNITS = {"accel": "m/s²", "gyro": "rad/s"}
-UNITS_LINE = "# accelerometers in m/s², gyroscopes in rad/s; noise_density per √Hz, correlation_time in s\n"
+SHEET_UNITS = {"accel": ("mGal", MILLIGAL), "gyro": ("°/h", DEG / 3600)}  # of data sheets, and their size
+UNITS_LINE = (
+    "# accelerometers in m/s², gyroscopes in rad/s; noise_density per √Hz, correlation_time in s\n"
+    "# instability: 1σ of the in-run bias, a Gauss-Markov process; not the bias instability B of the Allan deviation\n"
+)
 
 
 @dataclass(frozen=True)
@@ -221,15 +225,31 @@ def noise_table(log: StaticLog) -> ResultTable:
         row = [format_number(x) for x in (fit.density * walk, fit.floor * bias, fit.floor_s, fit.walk * bias * 60)]
         row += [format_number(fit.sigma * bias), time] if fit.rises else ["–", "–"]
         rows.append([f"{NAMES[name]}, all axes" if name in TRIADS else name.replace("_", " "), *row])
+    note = (
+        "Accelerometers: N in m/s/√h, B and bias in mGal, K in mGal/√h. Gyroscopes: N in °/√h, B and bias in °/h, "
+        "K in °/h/√h."
+    )
+    note += " τ*: too long for this log, taken from the preset." if any(row[-1].endswith("*") for row in rows) else ""
+    note += " –: the log is too short for it." if any("–" in row for row in rows) else ""
     return ResultTable(
         title=f"{log.drive}: {log.duration_s / 3600:.3g} h at rest, {log.rate_hz:g} Hz",
-        note=(
-            "Accelerometers: N in m/s/√h, B and bias in mGal, K in mGal/√h. Gyroscopes: N in °/√h, B and bias in °/h, "
-            "K in °/h/√h. τ*: too long for this log, taken from the preset; – the log is too short."
-        ),
+        note=note,
         columns=["Axis", "N", "B", "at [s]", "K", "In-run bias, 1σ", "τ [s]"],
         rows=rows,
     )
+
+
+def describe_noise(log: StaticLog) -> list[str]:
+    """A line for each triad: white noise and in-run bias."""
+    lines = []
+    for triad, walk, of_walk in zip(TRIADS, (60.0, 60 / DEG), ("m/s/√h", "°/√h")):
+        fit, (unit, size) = log.fits[triad], SHEET_UNITS[triad]
+        text = f"{NAMES[triad]}: white noise N = {format_number(fit.density * walk)} {of_walk}"
+        if fit.rises:
+            text += f", bias instability B = {format_number(fit.floor / size)} {unit}, in-run bias (1σ) "
+            text += f"{format_number(fit.sigma / size)} {unit} over {format_number(fit.time)} s"
+        lines.append(f"{text}.")
+    return lines
 
 
 def figure(log: StaticLog) -> Figure:
@@ -249,13 +269,16 @@ def figure(log: StaticLog) -> Figure:
         ax.plot([fit.floor_s], [fit.floor * 0.664], "s", mfc="white", mec="black", zorder=5, label="floor, 0.664 B")
         ax.set(title=NAMES[triad], xlabel="Cluster time τ [s]", ylabel=f"Allan deviation [{UNITS[triad]}]")
         plain_axes(ax)
+        unit, size = SHEET_UNITS[triad]
+        both = (lambda x, u=size: x / u, lambda x, u=size: x * u)
+        ax.secondary_yaxis("right", functions=both).set_ylabel(f"[{unit}]")
         ax.grid(True, which="minor", color="#EEEEEE", lw=0.8)
         ax.legend(frameon=False, fontsize=8, ncols=2)
     return out
 
 
 def _page(log: StaticLog, table: ResultTable, picture: bytes, settings: dict[str, str]) -> str:
-    page = Page(f"Allan deviation of {log.drive}", [table.title])
+    page = Page(f"Allan deviation of {log.drive}", [table.title, *describe_noise(log)])
     page.table(table.columns, table.rows)
     page.note(table.note)
     page.picture("Overlapping Allan deviation (IEEE Std 952)", embed_png(picture))
