@@ -26,6 +26,7 @@ from dlkf.evaluation.protocol import Protocol, Scenes, spread_evenly
 from dlkf.evaluation.study import make_results, run_scenes
 from dlkf.evaluation.table import all_tables
 from dlkf.filters.build import build_filter
+from dlkf.filters.smoother import SmoothedSolution
 from dlkf.filters.tuning import Prior, Tuning
 from dlkf.running.offline import (
     UsableFixes,
@@ -297,7 +298,11 @@ def test_models_by_name_and_folder(tmp_path):
     assert list(models) == ["ins", "mbkf15", "mbkf15#2"] and models["mbkf15"].tuning.accel_noise == 2.0
     prior = Prior([0.0] * 6, [1.0] * 6)
     assert resolve_model("mbkf15_prior", IMU, prior=prior).prior is prior
-    for spec, said in (("mbkf99", "ins, mbkf15"), (str(tmp_path), "no config.yaml"), ("mbkf15_prior", "prior")):
+    smoothed = resolve_models(["plus_rts"], IMU)
+    assert list(smoothed) == ["plus_rts"] and isinstance(smoothed["plus_rts"], SmoothedSolution)
+    for spec, said in (
+        ("mbkf99", "ins, mbkf15"), (str(tmp_path), "no config.yaml"), ("mbkf15_prior", "prior"), ("plud_rts", "plud"),
+    ):  # fmt: skip
         with pytest.raises(InputError, match=said):
             resolve_model(spec, IMU)
     (tmp_path / "model.pkl").write_bytes(b"\x80\x04")

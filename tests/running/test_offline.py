@@ -95,7 +95,7 @@ def test_the_summary_counts_the_fixes_of_the_file():
     late = driven(0)
     result = replace(late.result, aligned_at=9.0, table=late.result.table[10:])
     said = result.summary(late.fixes)
-    assert "from t = 10.0 s, none for the 10 fixes before, while it aligned, 1190 epochs, 1149 of 1200 fixes used" in said
+    assert "from t = 10.0 s, none for the 10 fixes before, while it aligned, 1190 epochs, 1149 of 1200 fixes" in said
 
 
 def test_the_summary_says_how_long_a_restart_took():
