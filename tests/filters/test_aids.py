@@ -15,7 +15,7 @@ from dlkf.data.augmentation import turn_frames
 from dlkf.data.resampling import SampleGrid
 from dlkf.data.segments import whole_drives
 from dlkf.data.store import load_dataset
-from dlkf.filters.aids.attach import SENSORS, aid_columns, find_tables, with_aids
+from dlkf.filters.aids.attach import SENSORS, aid_columns, describe_aids, find_tables, with_aids
 from dlkf.filters.aids.stretch import stretch_weights
 from dlkf.filters.aids.trust import PATIENCE, PROBATION, Trust, judge
 from dlkf.filters.build import build_filter
@@ -240,6 +240,14 @@ def test_only_filters_that_know_a_car_take_what_a_drive_has():
     both = build_filter("mbkf21_nhc+speed", IMU)
     assert with_aids(both, speed) is both
     assert both == with_aids(build_filter("mbkf21_nhc", IMU), speed)
+
+
+def test_a_sensor_of_a_dataset_says_who_takes_it():
+    """A filter that may take it and one that never does are not the same."""
+    names, speed = ("mbkf21_nhc", "mbkf15", "ins"), STANDARD["speed"]
+    models = {name: with_aids(build_filter(name, IMU), [speed]) for name in names}
+    (line,) = describe_aids(models, [speed])
+    assert line == "speed: used by mbkf21_nhc; mbkf15 takes it as mbkf15+speed; not by ins"
 
 
 def test_states_have_names():

@@ -96,10 +96,13 @@ def describe_aids(models: Mapping[str, Any], tables: Iterable[AidTable]) -> list
     lines = []
     for table in tables:
         takes = [name for name, model in models.items() if table in find_tables(model)]
-        others = [name for name in models if name not in takes]
+        others = [n for n in models if n not in takes and hasattr(find_kalman(models[n]), "sources")]
+        never = [name for name in models if name not in takes and name not in others]
         said = f"{table.name}: used by {', '.join(takes)}" if takes else f"{table.name}: used by no filter here"
         if others:
             said += f"; {', '.join(others)} {'takes' if len(others) == 1 else 'take'} it as {others[0]}+{table.name}"
+        if never and takes:
+            said += f"; not by {', '.join(never)}"
         lines.append(said)
     return lines
 
