@@ -64,7 +64,7 @@ def convert_value(hint: Any, value: Any, where: str) -> Any:
     wanted = " or ".join(dict.fromkeys(_describe_type(option) for option in options))
     remedy = ""
     if is_number(value) and any(_is_list(option) and str not in get_args(option) for option in options):
-        remedy = f"; such as {where}=[{value:g},0,0]"
+        remedy = f"; as a list: {where}=[{value:g},…]"
     elif str in options and is_number(value):
         remedy = f"; as a name: \"{where}='{value}'\""
     elif str in options and isinstance(value, (list, tuple)):

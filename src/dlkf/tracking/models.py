@@ -43,11 +43,11 @@ def resolve_model(
         raise InputError("model= is empty; give a name such as plus, or a folder")
     if is_filter(spec):
         return build_filter(spec, imu, tuning=tuning, prior=prior)
+    if OWN_SOURCE.fullmatch(spec):
+        return own_filter(spec, imu)
     if spec.endswith("_rts") and not Path(spec).expanduser().exists():
         causal = resolve_model(spec.removesuffix("_rts"), imu, tracking_uri, tuning=tuning, prior=prior)
         return run_smoother(causal, "rts")
-    if OWN_SOURCE.fullmatch(spec):
-        return own_filter(spec, imu)
     if spec == KNOWN_IMU:
         return build_plus(imu)
     if folder := shipped_folder(spec):
