@@ -6,8 +6,9 @@ from dataclasses import replace
 import pytest
 import torch
 
+from dlkf.filters.aids.attach import aid_columns
 from dlkf.filters.build import build_filter
-from dlkf.filters.fix_noise import LIMITS, QUANTILE, FixNoise
+from dlkf.filters.fix_noise import LEEWAY, LIMITS, QUANTILE, FixNoise
 from dlkf.filters.gating import chi2_quantile
 from dlkf.filters.integration import integrate
 from dlkf.filters.plus import ANY_MEMS
@@ -165,6 +166,38 @@ def test_plus_takes_no_position_for_good_that_is_noisy(down):
         integrate(replace(batch, gnss_valid=valid, start_std=std, start_noise=noise), Seen())
     least = torch.stack(used).amin(0)
     assert least[:, 0].median() > 0.5 and least[:, 1].median() > 0.5 * down
+
+
+def test_information_is_discounted_once_by_all_that_the_noise_is_larger():
+    """Velocities five times noisier than claimed; the noise falls and rises again."""
+    errors = white((0.2, 0.2, 0.5, 0.5), epochs=300)
+    errors[:, 100:200, 3:] /= 5
+    run = Watched()
+    with torch.inference_mode():
+        integrate(fixes(errors), run)
+    kept = torch.stack([noise.kept for noise in run.noises])
+    largest = torch.stack([noise.variance[:, 2] for noise in run.noises]).amax(0)
+    assert torch.allclose(kept[..., 1].prod(0), LEEWAY / largest, rtol=1e-9) and (largest > 15).all()
+    assert (kept[150:200, :, 1] == 1).all()
+
+
+def test_noise_does_not_pass_for_a_delay(monkeypatch):
+    """Velocities of 0.5 m/s that claim 5 cm/s: the delay that ``plus`` has after half a minute, over its 1σ."""
+    batch = slipping(16, 30, (0.0,) * 5)
+    errors = torch.zeros_like(batch.gnss)
+    errors[..., 3:] = white((0.0, 0.0, 0.5, 0.5), cars=16, epochs=30)[..., 3:]
+    batch = replace(batch, gnss=batch.gnss + errors, gnss_std=0 * batch.gnss_std + 0.05)
+    filter_ = trained_filter("plus")
+    columns = [aid_columns(filter_).index(name) for name in ("velocity_delay_s", "std_velocity_delay_s")]
+
+    def over_std() -> float:
+        with torch.inference_mode():
+            delay, std = integrate(batch, filter_).aids[:, -1, columns].unbind(-1)
+        return float((delay / std).square().mean().sqrt())
+
+    found = over_std()
+    monkeypatch.setattr(FixNoise, "kept", torch.ones(1, 2))
+    assert found < 1.4 and over_std() > 2.0
 
 
 @pytest.mark.commands

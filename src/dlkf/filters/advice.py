@@ -1,4 +1,4 @@
-"""Factors on one epoch's noise from outside the Kalman filter: from a network, or from tuning by gradient.
+"""Factors on one epoch's noise from outside the Kalman filter: from a network, estimates, or tuning by gradient.
 
 Everything is optional, and a factor of 1 changes nothing to the bit. Factors belong to standard deviations.
 """
@@ -16,6 +16,7 @@ class NetworkOutput(NamedTuple):
     process: Tensor | None = None  # (B, 4, 3) accelerometer and gyroscope noise, their walks; forward, right, down
     fix: Tensor | None = None  # (B, 4) position horizontal and down, velocity horizontal and down
     across: Tensor | None = None  # (B, 2) lateral and vertical constraint
+    kept: Tensor | None = None  # (B, 2) share of the information of earlier positions and velocities that still counts
 
     @property
     def fix_std(self) -> Tensor | None:

@@ -14,6 +14,10 @@ outage begins; so ln w of positions is a running quantile, a low one: it moves b
 by the share ``QUANTILE`` of it where the square is above that quantile of χ², else down by the rest. Of velocities w is
 a running mean, where a square counts with at most ``LARGEST``² w. A 1σ below the claimed one is
 :mod:`dlkf.filters.position_errors`' matter.
+
+Earlier fixes were taken for more exact than they are where w is larger than ever (by ``LEEWAY`` at first, since w is
+uncertain then): of their information only the share (largest w before) / w was justified, which
+:func:`dlkf.filters.receiver.discount_information` corrects for the states that a few false fixes decide.
 """
 
 from __future__ import annotations
@@ -35,8 +39,10 @@ MEMORY = 300.0  # fixes
 STEP, QUANTILE = 20.0, 0.3  # of ln w, over the number of fixes
 LIMITS = (0.3567, 0.1485)  # the quantile of χ² of two components, over two, and of one
 LARGEST = 3.0  # σ: the most that a change of a velocity's error counts
+LEEWAY = 2.0  # over w at the start, below which no information is discounted
 FLOOR = 3 * (FIT_STD,) + 3 * (0.0,)  # m
 DIFFERENCES = (20.0, 20.0, 2.0, 2.0)  # sums of the squared coefficients of Δ³ and Δ
+HORIZONTAL = [0, 2]  # of the parts of a fix
 SUCCESSIVE = (4.0, 4.0, 3.0, 3.0)  # fixes from which on one counts: Δ³ takes four, and a start's velocity is off
 
 
@@ -48,13 +54,20 @@ class FixNoise(NamedTuple):
     successive: Tensor  # (B, 4) fixes up to the last
     variance: Tensor  # (B, 4) w
     fixes: Tensor  # (B, 4) what w counts for
+    largest: Tensor  # (B, 2) largest w so far, of horizontal positions and velocities
 
     @classmethod
     def begin(cls, like: Tensor, size: int, noise: Float[Tensor, "B 2"] | None = None) -> FixNoise:
         """Before the first fix; ``noise``: √w of positions and velocities as the start has it."""
         zeros, parts = like.new_zeros, like.new_zeros(size, 4)
         variance = parts + 1.0 if noise is None else noise.square().repeat_interleave(2, -1)
-        return cls(zeros(size, 3, 3), zeros(size, 3), parts, variance, parts + FIRST_FIXES)
+        largest = LEEWAY * variance[:, HORIZONTAL].clamp_min(1.0)
+        return cls(zeros(size, 3, 3), zeros(size, 3), parts, variance, parts + FIRST_FIXES, largest)
+
+    @property
+    def kept(self) -> Float[Tensor, "B 2"]:
+        """Share of the information of all earlier positions and velocities that the last fix leaves."""
+        return self.largest / torch.maximum(self.largest, self.variance[:, HORIZONTAL])
 
     def inflate_fix(self, epoch: Epoch) -> Epoch:
         """The epoch with the 1σ of its fix as large as they have scattered."""
@@ -85,4 +98,5 @@ class FixNoise(NamedTuple):
         return FixNoise(
             torch.stack((apart, one, two), 1), residual[:, VELOCITY], successive,
             torch.where(counts, variance, self.variance), torch.where(counts, fixes, self.fixes),
+            torch.maximum(self.largest, self.variance[:, HORIZONTAL]),
         )  # fmt: skip

@@ -21,7 +21,14 @@ from dlkf.filters.gnss_fix import FixMemory, GnssFix
 from dlkf.filters.heavy_tails import HeavyTails
 from dlkf.filters.integration import Correction, Covariances, Epoch, Estimator
 from dlkf.filters.kalman_update import kalman_prediction, kalman_update
-from dlkf.filters.receiver import add_drift, has_receiver, let_delay_grow, predict_fix, widen_start
+from dlkf.filters.receiver import (
+    add_drift,
+    discount_information,
+    has_receiver,
+    let_delay_grow,
+    predict_fix,
+    widen_start,
+)
 from dlkf.filters.sources import Measurement, Parameter, Predicted, Source, describe_aid, predicted_variance
 from dlkf.filters.tuning import Prior, Tuning
 from dlkf.navigation.calibration import ImuError
@@ -257,6 +264,8 @@ class Mbkf:
         tails = memory.tails
         if tails is not None:
             tails, P, dx = tails.update(P, dx, epoch.error, self.states, epoch.used.any(-1))
+        if memory.parameters is not None and epoch.advice is not None and epoch.advice.kept is not None:
+            P, dx = discount_information(P, dx, memory.parameters, self.states, epoch.advice.kept)
         noise = memory.noise
         if noise is not None:
             R = self.fix.variance(epoch, memory.fix, noise)

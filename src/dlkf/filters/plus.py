@@ -214,7 +214,8 @@ class PlusFilter(nn.Module):
             torch.cat((torch.stack((same, x), 1), walks), 1) for x in (gyro_noise, gyro_noise ** weight.unsqueeze(-1))
         )
         process = in_force * torch.cat((levels, levels.clamp_min(1.0)), -1).unsqueeze(-1)
-        advice = NetworkOutput(process, memory.errors.noise(offered, kalman.fix.scale[0, 0, 0]))
+        of_fix = memory.errors.noise(offered, kalman.fix.scale[0, 0, 0])
+        advice = NetworkOutput(process, of_fix, kept=memory.fix_noise.kept)
         kalman, correction = self.kalman.update(memory.kalman, epoch._replace(advice=advice))
         rejected = self.kalman.find_rejected(memory.kalman, offered._replace(advice=advice), epoch, correction)
         with torch.no_grad():

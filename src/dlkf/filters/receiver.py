@@ -23,6 +23,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from dlkf.filters.branches import may_branch, select_branch
 from dlkf.filters.integration import Epoch, rate_before
 from dlkf.filters.sources import Parameter, SensorSource
 from dlkf.navigation.attitude import skew
@@ -73,6 +74,39 @@ def let_delay_grow(
     P[:, :, d] += grows * P[:, :, r]
     parameters[:, d - first] += grows * parameters[:, r - first]
     return P, parameters
+
+
+def discount_information(
+    P: Float[Tensor, "B n n"], dx: Float[Tensor, "B n"], parameters: Float[Tensor, "B k"], states: ErrorStates,
+    kept: Float[Tensor, "B 2"],
+) -> tuple[Float[Tensor, "B n n"], Float[Tensor, "B n"]]:  # fmt: skip
+    """P and correction if only the share ``kept`` of the information of positions and velocities about delays and antenna
+    was justified, since their noise is larger than the filter took it for.
+
+    With P₀ the variance of the prior, whose mean is zero, and x the estimate of a state after its correction:
+
+        1/P⁺ = 1/P₀ + s (1/P − 1/P₀),   x⁺ = x s P⁺/P
+
+    that is a measurement of x with negative information. The other states change by their covariance with it.
+    """
+    if not has_receiver(states):
+        return P, dx
+    discounted = (kept < 1).any(-1)
+    if may_branch(discounted) and not bool(discounted.any()):
+        return P, dx
+    before, first = (P, dx), states.of_others.start
+    for name in (DELAY, VELOCITY_DELAY, *ARM):
+        k, share = states.of(name).start, kept[:, int(name == VELOCITY_DELAY)]
+        column = P[:, k]
+        with torch.no_grad():
+            x, variance, prior = parameters[:, k - first] + dx[:, k], column[:, k], Receiver.parameters[name].std ** 2
+            gained = (1 - variance / prior).clamp_min(0.0)  # the rest is the prior
+            ratio = 1 / (1 - (1 - share) * gained)
+            change = torch.where(gained > 0, x * (share * ratio - 1), 0.0) / variance
+            factor = ((ratio - 1) / variance).unsqueeze(-1)
+        P = P + (factor * column).unsqueeze(-1) * column.unsqueeze(1)
+        dx = dx + change.unsqueeze(-1) * column
+    return select_branch(discounted, P, before[0]), select_branch(discounted, dx, before[1])
 
 
 def add_drift(Phi: Float[Tensor, "B n n"], states: ErrorStates, seconds: float) -> Float[Tensor, "B n n"]:

@@ -174,6 +174,7 @@ MEMORY = {  # by the last parts of a field's name
     "fix_noise.successive": "fixes in successive epochs, by part of a fix",
     "fix_noise.variance": "variance of the noise of fixes over the claimed one (of positions with 0.1 m more), by part",
     "fix_noise.fixes": "fixes that it counts for",
+    "fix_noise.largest": "largest such ratio so far, of horizontal positions and velocities",
     "steps.total": "sum of a bias' corrections over their 1σ, those long ago less, accelerometers and gyroscopes",
     "steps.weight": "variance of that sum where the noise is right",
 }
