@@ -340,9 +340,7 @@ def test_the_average_over_time_says_over_what_and_whether_anything_is_grey(score
     count = len(scores.segments)
     assert describe_average(scores) == f"RMS over {count} segments; grey where most of them have an outage."
     twice = replace(scores, segments=scores.segments * 2, outage=np.concatenate((scores.outage, ~scores.outage)))
-    said = (
-        f"RMS over {2 * count} runs ({count} drives, each with outages at 2 offsets); grey where most of them have"
-    )
+    said = f"RMS over {2 * count} runs ({count} drives, each with outages at 2 offsets); grey where most of them have"
     assert describe_average(twice) == f"{said} an outage (here nowhere)."
     assert describe_average(replace(scores, outage=scores.outage & False)) == f"RMS over {count} segments."
 

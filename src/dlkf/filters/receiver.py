@@ -80,8 +80,8 @@ def discount_information(
     P: Float[Tensor, "B n n"], dx: Float[Tensor, "B n"], parameters: Float[Tensor, "B k"], states: ErrorStates,
     kept: Float[Tensor, "B 2"],
 ) -> tuple[Float[Tensor, "B n n"], Float[Tensor, "B n"]]:  # fmt: skip
-    """P and correction if only the share ``kept`` of the information of positions and velocities about delays and antenna
-    was justified, since their noise is larger than the filter took it for.
+    """P and correction if only the share ``kept`` of the information of fixes about delays and antenna was justified,
+    since the noise of their positions and velocities is larger than the filter took it for.
 
     With P₀ the variance of the prior, whose mean is zero, and x the estimate of a state after its correction:
 
