@@ -34,7 +34,8 @@ from dlkf.filters.build import build_filter, is_filter
 from dlkf.filters.card import card_of_tuning, domain_warnings, select_scored_drives
 from dlkf.filters.saved import choose_grid
 from dlkf.report.evaluation import write_report
-from dlkf.running.offline import SAMPLES_AT_ONCE, UsableFixes, chunk_drives
+from dlkf.running.grid import UsableFixes
+from dlkf.running.offline import SAMPLES_AT_ONCE, chunk_drives
 from dlkf.running.references import check_reference
 from dlkf.tracking.grid import start_point
 from dlkf.tracking.models import resolve_models, unused_settings
@@ -74,16 +75,16 @@ def evaluate_dataset(settings: EvaluateSettings, console: Console, typed: Sequen
     taken = dict.fromkeys(table for model in models.values() for table in find_tables(model))
     check_engine(settings.parallel, settings.dataset)
     rows, name = drive_rows(settings.dataset, settings.drives), folder_name(settings.dataset)
-    rates = drive_rates(settings.dataset)
-    of_rows = [rates[row.name] for row in rows if row.name in rates]
-    step = choose_grid(models.values(), settings.rate_hz, settings.epoch_s, rates=of_rows)
+    rates = drive_rates(settings.dataset, [row.name for row in rows])
+    step = choose_grid(models.values(), settings.rate_hz, settings.epoch_s, rates=rates.values())
     grid = {**step, "aids": tuple(taken)}
     digest, kinds = dataset_digest(settings.dataset), drive_kinds(settings.dataset)
     cards = {model_name: getattr(model, "card", {}) for model_name, model in models.items()}
     kalman = [model_name for model_name in models if is_filter(model_name) and model_name != "ins"]
     cards |= card_of_tuning(kalman, settings.tuning)
     rows, seen = select_scored_drives(cards, rows, name, digest, leave_out=settings.unseen)
-    strange = domain_warnings(models, settings.dataset, [row.name for row in rows], spec.name, grid["rate_hz"])
+    rates = {row.name: rates[row.name] for row in rows if row.name in rates}
+    strange = domain_warnings(models, settings.dataset, rates, spec.name, grid["rate_hz"])
     untuned = describe_untuned(models, settings.tuning, spec.name)
     rounded = describe_rounding(protocol.outage, step["epoch_s"])
     unlike = f"no ratios: baseline={baseline} is not among the models" if baseline not in models else ""

@@ -21,12 +21,10 @@ from dlkf.command import command, list_typed_words
 from dlkf.command.settings import NavigateSettings
 from dlkf.data.drive import Drive
 from dlkf.data.kinds import drive_rates
-from dlkf.data.resampling import usual_rate
 from dlkf.data.store import choose_aids, dataset_digest, drive_rows, load_dataset
 from dlkf.data.tables import drive_clocks
 from dlkf.filters.aids.attach import describe_aids, find_tables, refuse_left_out, with_aids
 from dlkf.filters.card import domain_warnings
-from dlkf.filters.saved import choose_grid
 from dlkf.filters.smoother import run_smoother
 from dlkf.navigation.imu_errors import AUTO
 from dlkf.onboard.compiled_filter import compile_filter, compile_or_keep
@@ -34,6 +32,7 @@ from dlkf.onboard.core_drives import run_core_drive, runs_in_core
 from dlkf.report.navigation import MOST_DRIVES, TrackOnMap, navigation_page, summary_lines
 from dlkf.running import offline
 from dlkf.running.exports import choose_formats, export, find_row_qualities, utc_times
+from dlkf.running.grid import UsableFixes, choose_grid_for_logs
 from dlkf.running.innovations import OF_NETWORK, REMEDY
 from dlkf.running.likelihood import check_finds_noise, generic_filter
 from dlkf.running.replay import stream_drives
@@ -56,10 +55,9 @@ def main(settings: NavigateSettings) -> None:
     model = resolve_model(settings.model, spec, settings.tracking.uri, **settings.filter_options)
     clocks = drive_clocks(settings.dataset)
     rows, name = drive_rows(settings.dataset, settings.drives), short_name(settings.model)
-    spacings = {row.name: offline.UsableFixes.of(settings.dataset, row.name) for row in rows}
-    rates = [rate for drive, rate in drive_rates(settings.dataset).items() if drive in spacings]
-    usual = offline.choose_epoch(spacings.values(), settings.rate_hz or usual_rate(rates), model)
-    step = choose_grid([model], settings.rate_hz, settings.epoch_s, usual, rates)
+    spacings = {row.name: UsableFixes.of(settings.dataset, row.name) for row in rows}
+    rates = drive_rates(settings.dataset, spacings)
+    step = choose_grid_for_logs(model, spacings.values(), rates.values(), settings.rate_hz, settings.epoch_s)
     chosen = choose_aids(settings.dataset, settings.aids, settings.drives)
     if settings.aids is not None:
         refuse_left_out({name: model}, chosen)
@@ -67,7 +65,7 @@ def main(settings: NavigateSettings) -> None:
     grid = {**step, "aids": find_tables(model)}
     for line in describe_aids({name: model}, chosen):
         print(line)
-    for line in domain_warnings({name: model}, settings.dataset, spacings, spec.name, grid["rate_hz"]):
+    for line in domain_warnings({name: model}, settings.dataset, rates, spec.name, grid["rate_hz"]):
         print(line)
     if spec.name != AUTO and (line := unused_settings(settings.model, list_typed_words("imu", "tuning"))):
         print(line)

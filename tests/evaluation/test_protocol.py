@@ -28,8 +28,8 @@ from dlkf.evaluation.table import all_tables
 from dlkf.filters.build import build_filter
 from dlkf.filters.smoother import SmoothedSolution
 from dlkf.filters.tuning import Prior, Tuning
+from dlkf.running.grid import UsableFixes
 from dlkf.running.offline import (
-    UsableFixes,
     chunk_drives,
     load_chunk,
     navigate_chunks,

@@ -13,7 +13,8 @@ from dlkf.filters.build import build_filter
 from dlkf.filters.saved import choose_grid
 from dlkf.filters.shipped import trained_filter
 from dlkf.report.navigation import TrackOnMap, make_rows, route_map, sensor_rows, summary_lines
-from dlkf.running.offline import Innovation, Navigated, UsableFixes, choose_epoch
+from dlkf.running.grid import UsableFixes, choose_epoch
+from dlkf.running.offline import Innovation, Navigated
 from dlkf.running.solution import COLUMNS
 from tests.cars import IMU
 

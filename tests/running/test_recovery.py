@@ -19,8 +19,9 @@ from dlkf.filters.build import build_filter
 from dlkf.filters.learned import LearnedConfig, LearnedFilter
 from dlkf.filters.model_based import Ins
 from dlkf.filters.shipped import trained_filter
+from dlkf.running.grid import UsableFixes, choose_epoch
 from dlkf.running.loss import LossWatch, far_off
-from dlkf.running.offline import UsableFixes, choose_epoch, navigate_drives
+from dlkf.running.offline import navigate_drives
 from dlkf.running.replay import replay_drive
 from dlkf.running.streaming import StreamingFilter
 from dlkf.simulation.dataset import DatasetConfig, simulate_dataset

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -44,9 +44,10 @@ def drive_imus(dataset: str | Path) -> dict[str, str]:
     return {str(row["drive"]): row["imu"] for row in _rows(dataset) if isinstance(row.get("imu"), str) and row["imu"]}
 
 
-def drive_rates(dataset: str | Path) -> dict[str, float]:
-    """Samples a second [Hz] of every drive's IMU, by the median step of its first stamps."""
-    steps = {str(row["drive"]): np.diff(read_first_stamps(dataset, str(row["drive"]))) for row in _rows(dataset)}
+def drive_rates(dataset: str | Path, drives: Iterable[str] | None = None) -> dict[str, float]:
+    """Samples a second [Hz] of every drive's IMU, or of those named, by the median step of its first stamps."""
+    names = [str(row["drive"]) for row in _rows(dataset)] if drives is None else drives
+    steps = {drive: np.diff(read_first_stamps(dataset, drive)) for drive in names}
     return {drive: float(1 / np.median(step)) for drive, step in steps.items() if len(step) and np.median(step) > 0}
 
 

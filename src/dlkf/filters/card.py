@@ -9,7 +9,7 @@ from typing import Any
 
 from dlkf.base.documents import read_yaml
 from dlkf.base.errors import InputError, count_calls
-from dlkf.data.kinds import drive_imus, drive_rates
+from dlkf.data.kinds import drive_imus
 from dlkf.data.tables import DriveRow
 from dlkf.filters.tuning import Tuning
 
@@ -98,17 +98,17 @@ def warn_slow_drives(model: object, rate_hz: float) -> bool:
 
 
 def domain_warnings(
-    models: Mapping[str, object], dataset: str | Path, drives: Iterable[str], preset: str, rate_hz: int | float
+    models: Mapping[str, object], dataset: str | Path, rates: Mapping[str, float], preset: str, rate_hz: int | float
 ) -> list[str]:
-    """Lines for models on drives that they were not made for, by IMU and by rate of the samples.
+    """Lines for models on drives that they were not made for, by IMU and by rate of the samples (``rates``: of these
+    drives).
 
     The IMU is ``preset`` where the dataset names none; samples brought to ``rate_hz`` are as fast as they were at most.
     """
-    drives, imus = list(drives), drive_imus(dataset)
-    rates = drive_rates(dataset) if any(hasattr(model, "least_rate_hz") for model in models.values()) else {}
+    imus = drive_imus(dataset)
     cards = {name: getattr(model, "card", {}) for name, model in models.items()}
-    unmet = describe_unseen_imus(cards, {imus.get(drive, preset) for drive in drives})
-    return unmet + describe_slow_drives(models, [float(min(rate_hz, rates.get(drive, rate_hz))) for drive in drives])
+    unmet = describe_unseen_imus(cards, {imus.get(drive, preset) for drive in rates})
+    return unmet + describe_slow_drives(models, [float(min(rate_hz, rate)) for rate in rates.values()])
 
 
 def select_scored_drives(

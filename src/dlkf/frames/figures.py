@@ -16,7 +16,8 @@ from dlkf.evaluation.scores import Scores
 from dlkf.report.navigation import GAP_S, TrackOnMap, horizontal_std
 from dlkf.report.page import embed_png
 from dlkf.report.plots import spans
-from dlkf.running.offline import Navigated, UsableFixes
+from dlkf.running.grid import UsableFixes
+from dlkf.running.offline import Navigated
 
 DPI = 80
 

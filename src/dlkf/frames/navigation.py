@@ -99,14 +99,13 @@ def navigate(
 
     from dlkf.data.alignment import read_align
     from dlkf.data.kinds import drive_rates
-    from dlkf.data.resampling import usual_rate
     from dlkf.data.store import choose_aids, load_dataset
     from dlkf.filters.aids.attach import describe_aids, find_tables, with_aids
     from dlkf.filters.card import describe_slow_drives
-    from dlkf.filters.saved import choose_grid
     from dlkf.filters.smoother import run_smoother
+    from dlkf.running.grid import UsableFixes, choose_grid_for_logs
     from dlkf.running.innovations import OF_NETWORK, REMEDY
-    from dlkf.running.offline import UsableFixes, choose_epoch, navigate_drives
+    from dlkf.running.offline import navigate_drives
     from dlkf.tracking.models import short_name, takes_tuning
 
     given = {"rate_hz": rate_hz, "epoch_s": epoch_s}
@@ -125,8 +124,7 @@ def navigate(
         if smoothed:
             estimator = run_smoother(estimator, "rts")
         fixes = UsableFixes.of(folder, DRIVE)
-        usual = choose_epoch([fixes], rate_hz or usual_rate(rates), estimator)
-        grid = choose_grid([estimator], rate_hz, epoch_s, usual, rates)
+        grid = choose_grid_for_logs(estimator, [fixes], rates, rate_hz, epoch_s)
         drives = load_dataset(folder, dtype=torch.float64, reference=False, aids=find_tables(estimator), **grid)
         (navigated,) = navigate_drives(drives, estimator, align=read_align())
     solution = Solution.of(navigated, fixes, short_name(model), REMEDY if takes_tuning(model) else OF_NETWORK)

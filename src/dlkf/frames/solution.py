@@ -15,7 +15,8 @@ if TYPE_CHECKING:
 
     from dlkf.data.tables import DriveClock
     from dlkf.frames.figures import NotebookFigure
-    from dlkf.running.offline import Navigated, UsableFixes
+    from dlkf.running.grid import UsableFixes
+    from dlkf.running.offline import Navigated
 
 
 class Solution(pd.DataFrame):

@@ -16,8 +16,9 @@ from dlkf.report.drawing import Figure
 from dlkf.report.maps import add_track, chart, dots, join_tracks
 from dlkf.report.page import Page
 from dlkf.report.plots import Array, band, every, find_runs, line, shade, spans, stack_panels
+from dlkf.running.grid import UsableFixes
 from dlkf.running.innovations import SETTLE, Innovation
-from dlkf.running.offline import Navigated, UsableFixes
+from dlkf.running.offline import Navigated
 
 MOST_DRIVES = 12  # with plots of their own; all are on the map
 SHOWN = ("t", "lat_deg", "lon_deg", "vel_n", "vel_e", "std_pos_n", "std_pos_e", "gnss_used")  # of all drives

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
@@ -20,22 +19,19 @@ from dlkf.data.drive import Batch, Drive
 from dlkf.data.limits import NONE_REFUSED, Refused
 from dlkf.data.segments import whole_drives
 from dlkf.data.store import load_dataset
-from dlkf.data.tables import read_table
-from dlkf.data.validate import usable_fixes
-from dlkf.filters.aids.attach import aid_columns, find_kalman
+from dlkf.filters.aids.attach import aid_columns
 from dlkf.filters.aids.estimates import describe_estimate
-from dlkf.filters.constraints import CarConstraints
 from dlkf.filters.integration import BatchSolution, WholeLoop
 from dlkf.filters.receiver import ARM, DELAY, DRIFT, VELOCITY_DELAY
 from dlkf.filters.smoother import Filter, SmoothedSolution
 from dlkf.navigation.compiled import without_loops
 from dlkf.running.batched import CHUNK_SAMPLES, pack, run_filter
+from dlkf.running.grid import UsableFixes
 from dlkf.running.innovations import FAR, Innovation, fit_sigma, rms, worst_stretch
 from dlkf.running.loss import find_first_loss
 from dlkf.running.mounting import describe_mounting
 from dlkf.running.solution import SCHEMA, solution_table
 from dlkf.running.start import align_each
-from dlkf.running.start.entry import SLACK_S, SLOWEST_FIXES_S, SLOWEST_START_S
 
 FEW_DRIVES = 8  # whose start in tensor operations takes less than numba takes to load
 WORTH_SAYING = 0.01  # probability of another heading
@@ -46,63 +42,8 @@ SAMPLES_AT_ONCE = CHUNK_SAMPLES  # IMU samples of drives in memory, 8 h at 50 Hz
 LONG_RESTART_S = 10.0  # without rows, before the next is named
 VIBRATION = "vibration_speed"
 MOSTLY = 0.5  # of the updates of a further sensor; where fewer are used, its numbers are likely wrong
-REFUSED = "most of them refused: see its unit, sign and clock"
-
-
-@dataclass(frozen=True)
-class UsableFixes:
-    """The fixes in a drive's file that a filter could use: times [s], places [°], NMEA GGA quality."""
-
-    t: np.ndarray
-    lat_deg: np.ndarray
-    lon_deg: np.ndarray
-    quality: np.ndarray
-
-    @staticmethod
-    def of(folder: str | Path, drive: str) -> UsableFixes:
-        """Of a drive of a dataset."""
-        gnss = read_table(folder, "gnss", drive)
-        assert gnss is not None  # read_table raises where there is none
-        return UsableFixes.among(gnss)
-
-    @staticmethod
-    def among(gnss: dict[str, np.ndarray]) -> UsableFixes:
-        """Of a drive's table of fixes."""
-        usable = usable_fixes(gnss)
-        return UsableFixes(*(gnss[c][usable] for c in ("t", "lat_deg", "lon_deg", "quality")))
-
-    @property
-    def span_s(self) -> float:
-        """From the first to the last."""
-        return float(self.t[-1] - self.t[0]) if len(self.t) else 0.0
-
-    @property
-    def usual_s(self) -> float:
-        """Median spacing, to the millisecond; infinite with fewer than two fixes."""
-        return round(float(np.median(np.diff(self.t))), 3) if len(self.t) > 1 else np.inf
-
-    def between(self, first: float, last: float) -> int:
-        """Fixes after ``first`` and not after ``last``."""
-        return int(((self.t > first + 1e-3) & (self.t <= last + 1e-3)).sum())
-
-
 EARLY_S = 3.0  # before a solution begins, from which on a fix without one is worth saying
-
-
-def choose_epoch(spacings: Iterable[UsableFixes], rate_hz: float, estimator: Filter) -> float:
-    """Update interval [s] that uses every fix: the closest usual spacing.
-
-    1 s where it is no whole number of IMU samples, and at least for filters with constraints, whose noise is meant for
-    one a second. Of slow receivers that spacing in whole seconds.
-    """
-    closest = min((s.usual_s for s in spacings), default=1.0)
-    if SLOWEST_FIXES_S <= closest <= SLOWEST_START_S:
-        return float(math.ceil(closest - SLACK_S))
-    samples = closest * rate_hz if math.isfinite(closest) else 0.0  # no drive has two fixes: any grid will do
-    whole = samples >= 1 and abs(samples - round(samples)) < 1e-6
-    sources = getattr(find_kalman(estimator), "sources", ())
-    constrained = any(isinstance(source, CarConstraints) for source in sources)
-    return closest if closest < 1.0 and whole and not constrained else 1.0
+REFUSED = "most of them refused: see its unit, sign and clock"
 
 
 @dataclass(frozen=True)

@@ -55,12 +55,13 @@ class NavigationFilter(PythonModel):
         from dlkf.data.rows import split_drives
         from dlkf.data.store import choose_aids, drive_from_tables, drive_rows, load_dataset
         from dlkf.filters.aids.attach import find_tables, with_aids
-        from dlkf.running.offline import UsableFixes
+        from dlkf.running.grid import UsableFixes, choose_grid_for_logs
 
         if "dataset" in given and given["dataset"].notna().any():
             for folder in given["dataset"].dropna().explode():  # MLflow puts a list of words into one cell
                 rates = [*drive_rates(folder).values()]
-                grid = self._choose_grid([UsableFixes.of(folder, row.name) for row in drive_rows(folder)], rates)
+                fixes = [UsableFixes.of(folder, row.name) for row in drive_rows(folder)]
+                grid = choose_grid_for_logs(self.filter, fixes, rates)
                 estimator = with_aids(self.filter, choose_aids(folder, None))
                 options = {**grid, "reference": False, "aids": find_tables(estimator)}
                 yield folder, load_dataset(folder, dtype=torch.float64, **options), estimator
@@ -68,17 +69,8 @@ class NavigationFilter(PythonModel):
         arm = [float(params.get(f"lever_arm_{a}_m", 0.0)) for a in "xyz"]
         tables = list(split_drives(given, arm))
         rates = [1 / float(np.median(np.diff(t.imu["t"]))) for t in tables]
-        grid = self._choose_grid([UsableFixes.among(t.gnss) for t in tables], rates)
+        grid = choose_grid_for_logs(self.filter, [UsableFixes.among(t.gnss) for t in tables], rates)
         yield "", [drive_from_tables(t, "", **grid, dtype=torch.float64) for t in tables], self.filter
-
-    def _choose_grid(self, fixes: list, rates: list) -> dict[str, Any]:
-        """As ``dlkf navigate`` does where nothing is set."""
-        from dlkf.data.resampling import usual_rate
-        from dlkf.filters.saved import choose_grid
-        from dlkf.running.offline import choose_epoch
-
-        usual = choose_epoch(fixes, usual_rate(rates), self.filter)
-        return choose_grid([self.filter], usual_epoch_s=usual, rates=rates)
 
 
 set_model(NavigationFilter())
