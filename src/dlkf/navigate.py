@@ -80,7 +80,7 @@ def main(settings: NavigateSettings) -> None:
                 drives, settings.model, spec, tuning, settings.align, chosen,
                 progress=progress, compiler=compile_or_keep,
             )  # fmt: skip
-        print("found: " + ", ".join(f"{k} {v:.2g}" for k, v in found.describe().items()))
+        print("found, SI units: " + ", ".join(f"{k} {v:.2g}" for k, v in found.describe().items()))
         print(found.describe_offset())
         if doubt := found.describe_doubt():
             print(doubt)

@@ -154,7 +154,7 @@ def test_the_command_writes_what_the_others_take(uri, call, long_town, coarse):
 def test_navigate_finds_the_noise_by_itself(call, long_town, coarse):
     one = (f"dataset={long_town}", "drives=[car-00]", "rate_hz=20", "out=solved")
     done = call("navigate", "model=mbkf15", "imu=auto", *one)
-    assert done.code == 0 and "found: accel.noise_density" in done.out, done.err
+    assert done.code == 0 and "found, SI units: accel.noise_density" in done.out, done.err
     assert Path("solved/drive=car-00/solution.parquet").is_file()
 
 
