@@ -38,6 +38,9 @@ PPM = 1e-6
 MOVING = 1.0  # m/s: a slower car shows no delay
 SLOPE_S = 0.2  # s to either side of a fix, over which the acceleration is a mean
 
+# sums of states that fixes show, by positions (0) and velocities (1): a velocity that of both delays
+SHOWN = (((DELAY,), 0), ((DELAY, VELOCITY_DELAY), 1), *(((name,), 0) for name in ARM))
+
 
 class Receiver(SensorSource):
     """Delays of fixes and velocities, antenna and clock; it has no rows of its own, those of the fix contain them."""
@@ -83,7 +86,8 @@ def discount_information(
     """P and correction if only the share ``kept`` of the information of fixes about delays and antenna was justified,
     since the noise of their positions and velocities is larger than the filter took it for.
 
-    With P₀ the variance of the prior, whose mean is zero, and x the estimate of a state after its correction:
+    Positions show the delay and the antenna, velocities the sum of both delays. With P₀ the variance of the prior,
+    whose mean is zero, and x the estimate of such a quantity after its correction:
 
         1/P⁺ = 1/P₀ + s (1/P − 1/P₀),   x⁺ = x s P⁺/P
 
@@ -95,11 +99,13 @@ def discount_information(
     if may_branch(discounted) and not bool(discounted.any()):
         return P, dx
     before, first = (P, dx), states.of_others.start
-    for name in (DELAY, VELOCITY_DELAY, *ARM):
-        k, share = states.of(name).start, kept[:, int(name == VELOCITY_DELAY)]
-        column = P[:, k]
+    for names, part in SHOWN:
+        which, share = [states.of(name).start for name in names], kept[:, part]
+        column = P[:, which].sum(1)
         with torch.no_grad():
-            x, variance, prior = parameters[:, k - first] + dx[:, k], column[:, k], Receiver.parameters[name].std ** 2
+            x = (parameters[:, [k - first for k in which]] + dx[:, which]).sum(-1)
+            variance = column[:, which].sum(-1)
+            prior = sum(Receiver.parameters[name].std ** 2 for name in names)
             gained = (1 - variance / prior).clamp_min(0.0)  # the rest is the prior
             ratio = 1 / (1 - (1 - share) * gained)
             change = torch.where(gained > 0, x * (share * ratio - 1), 0.0) / variance
