@@ -5,6 +5,9 @@ that of a measured fix does by chance alone, while the car brakes, turns or spee
 where it is that of the last fix within ``SAME`` (horizontally), while the INS, since the first fix with it, has gained
 more than ``GAINED`` and ``SIGMAS`` of what tilt and biases explain; and so are those after it, until it changes. The
 position is none either where it has moved as far as this velocity says, within ``ALONG``.
+
+Of a receiver without velocities, the velocity is that between its last two positions, the same where the last one lies
+within ``STRAIGHT`` of where those before it lead; it is a mean, and so is then that of the INS.
 """
 
 from __future__ import annotations
@@ -16,22 +19,26 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dlkf.filters.integration import Epoch
+from dlkf.navigation.attitude import skew
 from dlkf.navigation.earth import STANDARD_GRAVITY
 from dlkf.navigation.state import ACCEL, ATTITUDE
 
 SAME = 0.01  # m/s: between two velocities of which the second is the first one
-GAINED, SIGMAS = 0.3, 3.0  # m/s; 1σ of the INS
+GAINED, SIGMAS = 0.1, 3.0  # m/s; 1σ of the INS
 ALONG = 0.2  # m: between an extrapolated position and the last one moved on
+STRAIGHT = 0.05  # m: the same of a receiver without velocities, whose positions the log rounds
 LAST_S = 5.0  # between two fixes that are compared
 
 
 class Coasting(NamedTuple):
     """What the velocity of the last fixes was, and the INS's change since it is the same."""
 
-    place: Tensor  # (B, 2) m, of the last fix with a velocity
-    velocity: Tensor  # (B, 2) m/s, of that fix; NaN: none
+    place: Tensor  # (B, 2) m, of the last fix with a velocity, or with a position alone if that is long ago
+    velocity: Tensor  # (B, 2) m/s, of that fix, or between it and the one before; NaN: none
+    measured: Tensor  # (B,) bool: that fix has a velocity
     age: Tensor  # (B,) s since that fix
     gained: Tensor  # (B, 2) m/s, by the INS since the first fix with it
+    lead: Tensor  # (B, 2) m/s, of the INS's velocity at the end of the last window over its mean in it
     std: Tensor  # (B,) m/s, 1σ of that
     found: Tensor  # (B, 2) bool: position and velocity of the last fix are no measurements
 
@@ -40,21 +47,32 @@ class Coasting(NamedTuple):
         """No fix yet."""
         zeros, B = like.new_zeros, len(like)
         nothing = torch.full_like(zeros(B, 2), torch.nan)
-        return cls(zeros(B, 2), nothing, zeros(B), zeros(B, 2), zeros(B), zeros(B, 2) > 0)
+        return cls(zeros(B, 2), nothing, zeros(B) > 0, zeros(B), zeros(B, 2), zeros(B, 2), zeros(B), zeros(B, 2) > 0)
 
     def update(self, epoch: Epoch, P: Float[Tensor, "B n n"]) -> Coasting:
         """After an update interval that begins with the covariance ``P``."""
-        moves, age = epoch.used[:, 3:5].all(-1), self.age + epoch.span_s
-        place, velocity = epoch.fix.value[:, :2], epoch.fix.value[:, 3:5]
-        gained = self.gained + (epoch.window.end.v_n - epoch.start.v_n)[:, :2]
-        std = self.std + epoch.span_s * acceleration_variance(epoch, P).sqrt()  # an error of tilt stays
-        same = moves & ((velocity - self.velocity).norm(dim=-1) < SAME) & (age < LAST_S + 0.5 * epoch.span_s)
+        start, end, age = epoch.start, epoch.window.end, self.age + epoch.span_s
+        recent, measured = age < LAST_S + 0.5 * epoch.span_s, epoch.used[:, 3:5].all(-1)
+        alone = epoch.used[:, :2].all(-1) & ~measured & ~(self.measured & recent)
+        fixed, of_fix = measured | alone, torch.where(measured | alone, measured, self.measured)
+        place = epoch.fix.value[:, :2]
+        between = (place - self.place) / age.unsqueeze(-1)
+        velocity = torch.where(measured.unsqueeze(-1), epoch.fix.value[:, 3:5], between)
+
+        mean = (end.p_n - start.p_n)[:, :2] / epoch.span_s  # of the INS, as ``between`` is one
+        at_ends, of_means = (end.v_n - start.v_n)[:, :2], mean - start.v_n[:, :2] + self.lead
+        gained = self.gained + torch.where(of_fix.unsqueeze(-1), at_ends, of_means)
+        std = self.std + epoch.span_s * _acceleration_std(epoch, P)  # an error of tilt stays
+
+        change = (velocity - self.velocity).norm(dim=-1)
+        same = fixed & recent & (change < torch.where(measured, SAME, STRAIGHT / age))
         stale = same & (self.found[:, 1] | (gained.norm(dim=-1) > GAINED + SIGMAS * std))
         along = (place - self.place - age.unsqueeze(-1) * velocity).norm(dim=-1) < ALONG
-        m, new = moves.unsqueeze(-1), moves & ~same
+        f, new = fixed.unsqueeze(-1), fixed & ~same
         return Coasting(
-            torch.where(m, place, self.place), torch.where(m, velocity, self.velocity), torch.where(moves, 0.0, age),
-            torch.where(new.unsqueeze(-1), 0.0, gained), torch.where(new, 0.0, std),
+            torch.where(f, place, self.place), torch.where(f, velocity, self.velocity), of_fix,
+            torch.where(fixed, 0.0, age), torch.where(new.unsqueeze(-1), 0.0, gained), end.v_n[:, :2] - mean,
+            torch.where(new, 0.0, std),
             torch.where(epoch.used.any(-1, keepdim=True), torch.stack((stale & along, stale), 1), self.found),
         )  # fmt: skip
 
@@ -66,3 +84,12 @@ def acceleration_variance(epoch: Epoch, P: Float[Tensor, "B n n"]) -> Float[Tens
     force = epoch.corrected[..., :2].mean(1).square().sum(-1)
     tilt, heading = variance[:, ATTITUDE][:, :2].amax(-1), variance[:, ATTITUDE][:, 2]
     return STANDARD_GRAVITY**2 * tilt + force * heading + variance[:, ACCEL].amax(-1)
+
+
+def _acceleration_std(epoch: Epoch, P: Float[Tensor, "B n n"]) -> Float[Tensor, " B"]:
+    """Of the INS's horizontal acceleration [m/s²], δa = f × δh + C ε: tilt and biases, which may cancel each other."""
+    C = epoch.window.end.C_nb
+    force_n = torch.bmm(C, epoch.corrected[..., :3].mean(1).unsqueeze(-1)).squeeze(-1)
+    J = torch.cat((skew(force_n), C), -1)[:, :2]
+    wrong = slice(ATTITUDE.start, ACCEL.stop)
+    return torch.einsum("bij,bjk,bik->b", J, P[:, wrong, wrong], J).clamp_min(0.0).sqrt()
