@@ -127,3 +127,37 @@ def test_what_moves_slowly_is_no_noise():
     run = watched(steps.cumsum(1))
     expected = (2 * 0.3**2 + 0.5 * 0.3**2 + 3 / 303 * STD**2) ** 0.5 / STD
     assert abs(float(run.noises[-1][:, 0].mean()) / expected - 1) < 0.1
+
+
+def test_a_receiver_that_says_that_it_is_worse_is_believed():
+    """Two minutes of slow errors of 2 mm with a claim of 2 cm, of which the white share is small; then fixes 2 m off
+    that claim 2.5 m, as of a receiver that has lost RTK. Their noise is as claimed but for what is usual, and nothing
+    wanders by metres; what the means say of usual fixes stays, and so does their noise afterwards."""
+    T, bad = 150, slice(120, 135)
+    g = torch.Generator().manual_seed(4)
+    errors = 2e-3 * torch.randn(4, 1, 3, generator=g).expand(-1, T, -1).double().clone()
+    claim = torch.full((4, T, 3), 0.02, dtype=torch.float64)
+    errors[:, bad, :2] += 2.0 * torch.nn.functional.normalize(torch.randn(4, 1, 2, generator=g), dim=-1)
+    claim[:, bad] = 2.5
+    run = watched(errors, claim=claim)
+    noise, variance = (torch.stack(x)[..., 0] for x in (run.noises, run.variances))
+    white = torch.stack([e.white for e in run.errors])[..., 0]
+    assert (noise[110:120] < 0.8).all()
+    assert (noise[bad] > 0.99).all() and (variance[bad] < 0.1**2).all()
+    assert torch.equal(white[bad.start - 1].expand(bad.stop - bad.start, -1), white[bad])
+    slow = torch.stack([e.slow for e in run.errors])[..., 0]
+    assert (slow[bad] < 0.12**2).all()
+    assert ((noise[140:] - noise[119]).abs() < 0.1).all()
+
+
+def test_a_receiver_that_stays_worse_is_learned_anew():
+    """Half a minute of centimetres, then five minutes of 2 m that wander: after these, as of such a receiver."""
+    T, first = 330, 30
+    g, decay = torch.Generator().manual_seed(5), math.exp(-1 / TAU)
+    errors, now = torch.zeros(8, T, 3, dtype=torch.float64), STD * torch.randn(8, 3, generator=g)
+    for k in range(first, T):
+        errors[:, k] = now = decay * now + math.sqrt(1 - decay**2) * STD * torch.randn(8, 3, generator=g)
+    claim = torch.where(torch.arange(T) < first, 0.02, STD).double()[None, :, None].expand(8, -1, 3)
+    last = watched(errors, claim=claim).errors[-1]
+    assert (last.usual.sqrt() > 0.95 * STD).all() and (last.white.mean(0) < 0.15).all()
+    assert (last.slow > (0.7 * STD) ** 2).all()

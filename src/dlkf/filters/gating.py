@@ -17,6 +17,11 @@ wrong: those are no outliers, but would be if the filter had moved with the refu
 become usual. A receiver that repeats the same fix while the car moves is frozen, and not used until it changes; one
 that extrapolates its last fix neither (:mod:`dlkf.filters.coasting`).
 
+A filter that has agreed with the fixes for ``STEADY_S`` is not wrong from one second to the next; a receiver is, for
+some seconds at a time: multipath, a wrong ambiguity, or a tunnel in which it goes on by itself. So for ``HOLD_S`` it
+does not follow fixes that agree with each other alone; nor do they become usual, and positions beside such velocities
+are left out. After an outage of ``HOLD_S`` it follows as before.
+
 Filters without that gate have a coarse one that cannot be switched off (:class:`CoarseGate`): a fix ``COARSE_SIGMAS``
 off, such as the first one after a tunnel, is left out, and so are the fixes of a frozen receiver: positions that are
 the same to the bit while the filter has moved, or those that coast. On data whose noise is as stated it never acts.
@@ -38,6 +43,8 @@ from dlkf.filters.integration import Epoch
 from dlkf.navigation.state import POSITION, PV, VELOCITY
 
 PATIENCE = 2  # refused fixes in a row that agree with each other before the filter follows them
+HOLD_S, STEADY_S = 10.0, 20.0  # s that it does not, after so long with hardly a refusal
+REFUSAL_S = 5.0  # s, by which a refusal by itself shortens that time
 AGREEMENT_SIGMAS, AGREEMENT_RATES = 6.0, (5.0, 2.0)  # two refusals agree within 6σ of the fixes + 5 m/s, 2 m/s² · time
 FLOOR = 0.05  # m, m/s added to 1σ of an innovation
 USUAL_STEP = 0.3  # per fix, by which the logarithm of the usual squared innovation follows
@@ -72,6 +79,8 @@ class GateMemory(NamedTuple):
     age: Tensor  # (B, 2) s since then
     fix: Tensor  # (B, 3) the last position offered
     frozen: Tensor  # (B,) bool: it did not move with the car
+    steady: Tensor  # (B, 2) s with hardly a refusal, of positions and of velocities
+    lost: Tensor  # (B, 2) s since the last that was not refused
     coasting: Coasting
     limits: Tensor  # (1, 4) of d² of each part over s², the same for all drives
 
@@ -226,7 +235,8 @@ class Gate:
         usual = zeros(B, 4) + self.usual
         nothing = zeros(B) > 0
         return GateMemory(
-            usual, zeros(B, 2), zeros(B, 6), zeros(B, 2), nowhere, nothing, Coasting.begin(like), limits
+            usual, zeros(B, 2), zeros(B, 6), zeros(B, 2), nowhere, nothing, zeros(B, 2), zeros(B, 2),
+            Coasting.begin(like), limits,
         )  # fmt: skip
 
     def screen_fix(
@@ -271,20 +281,30 @@ class Gate:
         far = average_by_part(torch.cat((z[:, :3] - way, way), -1).square() / S)[:, :2]
         fits = offered[:, :2] & ~outlier[:, :2] & (far > limit[:, :2])
         denied = torch.stack((torch.zeros_like(position), (outlier[:, 2:] & fits).any(-1)), -1)
-        follows = follows & ~denied
+        lost = memory.lost + span
+        holds = (memory.steady > STEADY_S) & (lost < HOLD_S - 0.5 * span)
+        follows = follows & ~denied & ~holds
+        held = wrong & ~denied & holds & (refused >= PATIENCE)
         of_parts, of_components = follows[:, [0, 0, 1, 1]], follows[:, [0, 0, 0, 1, 1, 1]]
 
         passed = offered & (~outlier | of_parts)
-        passed = (passed & (passed[:, :1] | ~offered[:, :1]))[:, OF_PART] & used
+        passed = passed & (passed[:, :1] | ~offered[:, :1]) & ~held[:, 1:]
+        passed = passed[:, OF_PART] & used
+        good, late = seen & ~wrong, lost >= HOLD_S - 0.5 * span
+        gained = torch.where(good, span, torch.where(wrong & ~agrees, -REFUSAL_S, 0.0))
+        anew = follows | (good & late) | coasting.found
+        steady = torch.where(anew, 0.0, (memory.steady + gained).clamp(0.0, 2 * STEADY_S))
         more = square > square.new_tensor(MEDIANS) * torch.exp(memory.usual)
         usual = (memory.usual + torch.where(more, USUAL_STEP, -USUAL_STEP)).clamp_min(0.0)
         return GateMemory(
-            torch.where(offered & ~denied[:, [0, 0, 1, 1]], usual, memory.usual),
+            torch.where(offered & ~(denied | held)[:, [0, 0, 1, 1]], usual, memory.usual),
             torch.where(follows, 0.0, refused),
             torch.where(wrong[:, [0, 0, 0, 1, 1, 1]], z, memory.innovation),
             torch.where(wrong, 0.0, age),
             torch.where(position.unsqueeze(-1), epoch.fix.value[:, :3], memory.fix),
             torch.where(position, frozen, memory.frozen),
+            steady,
+            torch.where(good | follows, 0.0, lost),
             coasting,
             memory.limits,
         ), passed, torch.where(of_components & passed, z * z, 0.0)  # fmt: skip

@@ -19,10 +19,16 @@ that is less than claimed; what moves slower is a wander of the position. It ris
 larger (``QUICK`` fixes). Fixes of a stationary car count only where the carrier phase gives them: other receivers hold
 their position then. Horizontal and vertical errors have means of their own. The 1σ of a position has the part that is
 not white beside the filter's own.
+
+All this is of errors of the usual σ. Where a receiver says that a fix is worse, before a tunnel or when it loses RTK,
+that fix shows nothing of where the slow error has gone: of its σ² only what is below (``USUAL`` s)² has the factor and
+the walk, the rest is white noise as claimed. ln s² follows ln σ² with a time constant of ``RISE_S`` upwards, ``FALL_S``
+downwards. Changes of the error to such a fix, or between two whose σ differ by more than ``USUAL``, do not count.
 """
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import torch
@@ -41,6 +47,7 @@ LARGEST = 5.0  # σ: the most that a change of the error counts
 NOISE_S = 4.0  # an error that takes longer to change is no noise
 MOVING = 1.0  # m/s: slower cars are left out, but for receivers of ``CARRIER_STD``
 LEAST_STD = 0.02  # m, the least 1σ of a fix that is made smaller than claimed
+USUAL, RISE_S, FALL_S = 2.0, 60.0, 5.0  # σ over the usual one, s
 PART = [0, 0, 1]  # of a position's components: horizontal, vertical
 
 
@@ -56,12 +63,16 @@ class PositionErrors(NamedTuple):
     recent: Tensor  # (B, 2) mean of (u² − P_v Δt² / σ²) / 2 over the last fixes
     fixes: Tensor  # (B, 2) what the means count for
     slow: Tensor  # (B, 3) m², variance of the last fix that is not white
+    last: Tensor  # (B, 2) m², σ² of the last fix
+    usual: Tensor  # (B, 2) m², s²; inf: none yet
 
     @classmethod
     def begin(cls, like: Tensor, size: int) -> PositionErrors:
         """Before the first fix."""
         zero, zeros = like.new_zeros(size, 2), like.new_zeros(size, 3)
-        return cls(zeros, zeros, zero, zero + 1.0, zero, zero + 1.0, zero, zero + USUAL_FIXES, zeros)
+        return cls(
+            zeros, zeros, zero, zero + 1.0, zero, zero + 1.0, zero, zero + USUAL_FIXES, zeros, zero, zero + math.inf
+        )
 
     @property
     def white_share(self) -> Float[Tensor, "B 2"]:
@@ -71,18 +82,23 @@ class PositionErrors(NamedTuple):
     def variance(self, epoch: Epoch) -> Float[Tensor, "B 3"]:
         """By which the errors of the positions have moved in this update interval [m²]; zero without a fix."""
         largest = (1 - self.white_share.clamp_max(1.0)) * _largest_walk(epoch.span_s)
-        std = torch.where(epoch.used[:, POSITION], epoch.fix.std[:, POSITION], 0.0)
-        return torch.minimum(self.walk.clamp_min(0.0), largest)[:, PART] * std.square()
+        variance = torch.where(epoch.used[:, POSITION], epoch.fix.std[:, POSITION].square(), 0.0)
+        return (torch.minimum(self.walk.clamp_min(0.0), largest) * self._usual_share(epoch))[:, PART] * variance
 
     def noise(self, epoch: Epoch, position_std: Float[Tensor, ""]) -> Float[Tensor, "B 4"]:
         """Factors on the 1σ of position, horizontal and down, and of velocity (1), of a filter that takes positions
         for ``position_std`` times as noisy as claimed."""
         intervals = NOISE_S / epoch.span_s
         slow = self.white_share + 0.5 * intervals * self.walk.clamp_min(0.0)
-        factor = torch.maximum(slow, 0.5 * self.recent).clamp_min(1e-6).sqrt()
+        share = self._usual_share(epoch)
+        factor = (1 - share * (1 - torch.maximum(slow, 0.5 * self.recent))).clamp_min(1e-6).sqrt()
         least = LEAST_STD / (position_std * epoch.fix.std[:, [0, 2]]).clamp_min(LEAST_STD)
         factor = torch.maximum(factor, least).clamp_max(1.0)
         return torch.cat((factor, torch.ones_like(factor)), -1)
+
+    def _usual_share(self, epoch: Epoch) -> Float[Tensor, "B 2"]:
+        """Of the σ² of a fix, what is below (``USUAL`` s)²."""
+        return (USUAL**2 * self.usual / _of_parts(epoch)).clamp_max(1.0)
 
     def add_slow_std(self, std: Float[Tensor, "B k"]) -> Float[Tensor, "B k"]:
         """1σ of the states with that of the position by which the receiver is off for long: no filter averages it."""
@@ -108,15 +124,29 @@ class PositionErrors(NamedTuple):
         recent = self.recent + (0.5 * excess - self.recent) / QUICK
         square = self.square + (0.5 * square - self.square) / (fixes - USUAL_FIXES + FEW_FIXES)
         shown = (epoch.window.end.v_n.norm(dim=-1) > MOVING) | (std[:, :2].amax(-1) < CARRIER_STD)
-        counts = (successive >= 3) & shown.unsqueeze(-1)  # two changes of the error
+        variance = _of_parts(epoch)
+        alike = (variance < USUAL**2 * self.last) & (self.last < USUAL**2 * variance)
+        fits = alike & (variance < USUAL**2 * self.usual)
+        counts = (successive >= 3) & shown.unsqueeze(-1) & fits  # two changes of the error
         residual = z - torch.bmm(c.H[:, POSITION], c.dx.unsqueeze(-1)).squeeze(-1)
         found = PositionErrors(
             torch.where(used, residual, 0.0), change, successive, torch.where(counts, white, self.white),
             torch.where(counts, walk, self.walk), torch.where(counts, square, self.square),
             torch.where(counts, recent, self.recent), torch.where(counts, fixes, self.fixes), self.slow,
+            torch.where(used[:, [0, 2]], variance, self.last), self.usual,
         )  # fmt: skip
-        slow = (1 - found.white_share.clamp_max(1.0))[:, PART] * std.square()
-        return found._replace(slow=torch.where(used, slow, self.slow))
+        slow = ((1 - found.white_share.clamp_max(1.0)) * self._usual_share(epoch))[:, PART] * std.square()
+        rise, fall = (-math.expm1(-span / seconds) for seconds in (RISE_S, FALL_S))
+        usual = self.usual * torch.exp(torch.where(variance > self.usual, rise, fall) * (variance / self.usual).log())
+        usual = torch.where(self.usual.isinf(), variance, usual)
+        return found._replace(
+            slow=torch.where(used, slow, self.slow), usual=torch.where(used[:, [0, 2]], usual, self.usual)
+        )
+
+
+def _of_parts(epoch: Epoch) -> Float[Tensor, "B 2"]:
+    """σ² of a position, horizontal and down [m²]; 1 where there is none."""
+    return torch.where(epoch.used[:, [0, 2]], epoch.fix.std[:, [0, 2]], 1.0).square()
 
 
 def _parts(x: Float[Tensor, "B 3"]) -> Float[Tensor, "B 2"]:
