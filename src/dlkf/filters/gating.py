@@ -304,7 +304,7 @@ class Gate:
             torch.where(position.unsqueeze(-1), epoch.fix.value[:, :3], memory.fix),
             torch.where(position, frozen, memory.frozen),
             steady,
-            torch.where(good | follows, 0.0, lost),
+            torch.where(good, 0.0, lost),
             coasting,
             memory.limits,
         ), passed, torch.where(of_components & passed, z * z, 0.0)  # fmt: skip
