@@ -11,7 +11,7 @@ import pytest
 from dlkf.base.errors import InputError
 from dlkf.data.plausibility import check_gnss_units, check_imu_units
 from dlkf.data.readers.units import LENGTH
-from dlkf.data.schema import drive_file, write_drive, write_drives_table
+from dlkf.data.schema import VELOCITY, drive_file, write_drive, write_drives_table
 from dlkf.data.store import load_dataset
 from dlkf.data.validate import LIMITS, Limits, find_gaps, read_drive, validate_dataset
 from dlkf.simulation.dataset import DatasetConfig, simulate_dataset
@@ -33,6 +33,14 @@ def _complaint(folder, **kwargs) -> str:
     text = str(error.value)
     assert "\n" not in text and len(text) < 400
     return text
+
+
+_NO_VELOCITY = dict.fromkeys(VELOCITY, np.nan)
+
+
+def _again(times: int):
+    """Every fix so many times at a rate that the receiver has not."""
+    return lambda f: pd.concat([f.assign(t=f["t"] + k / times) for k in range(times)]).sort_values("t")[: -times + 1]
 
 
 def _set(kind: str, column: str, change):
@@ -173,6 +181,8 @@ BAD = {
     "leap seconds": (_set("gnss", "t", lambda t: t - 18), r"clocks of IMU and GNSS are 18.0 s apart.*offset_s=auto"),
     "turned right": (_rows("imu", _quarter), r"turned by \+90° .*reader.imu.accel.axes"),
     "another clock": (_set("gnss", "t", lambda t: t + 1e5), "same clock"),
+    "fixes of a logger": (_rows("gnss", _again(5)), "100 % of the fixes .*first row of each .*gnss.rows=changed"),
+    "positions of a logger": (_rows("gnss", lambda f: _again(2)(f.assign(**_NO_VELOCITY))), "come several times"),
     "an IMU of a moment": (_rows("imu", lambda f: f[:50]), r"share 0.5 s with the IMU, from 0.010 to 0.500; give logs"),
     "negative std": (_set("gnss", "std_pos_n", _at(2, -1.0)), "row 2: std_pos_n is -1.0"),
     "attitude in degrees": (_columns("reference", _scale(["yaw"], 180 / np.pi)), "yaw reaches .* degrees"),

@@ -1,4 +1,5 @@
-"""IMUs of which an axis does not change, or which repeat their last sample, though the car moves."""
+"""IMUs of which an axis does not change, or which repeat their last sample, though the car moves; and tables of fixes
+that have each of them several times."""
 
 from __future__ import annotations
 
@@ -6,7 +7,7 @@ import numpy as np
 
 from dlkf.base.angles import wrap_angle
 from dlkf.base.errors import InputError
-from dlkf.data.discovery.motion import Motion, find_motion
+from dlkf.data.discovery.motion import Motion, displacements, find_motion
 from dlkf.data.limits import FROZEN_IMU_S, FROZEN_SPEED_M_S, known_speed
 from dlkf.data.schema import ACCEL, GYRO, VELOCITY, stack_columns
 from dlkf.data.tables import Columns
@@ -19,6 +20,7 @@ LEAST_SAME = 10  # samples of an axis that is stuck
 SOME_SAME, COARSE = 0.2, 0.01  # of FROZEN_IMU_S; of the time in motion that a coarse axis repeats so long
 TIMES_USUAL = 10.0  # the longest repeat of an axis at work
 BETWEEN = 20  # changes there are for each time that an axis sticks; of a coarse one fewer
+OFTEN, STEP_M = 0.5, 2.0  # share of a moving car's fixes that repeat; m between two that no rounding makes the same
 TURNING_BACK = 0.1  # of its changes: of noise every second one, of a smooth signal none
 
 
@@ -72,6 +74,21 @@ def check_frozen(imu: Columns, gnss: Columns, where: str) -> None:
                 f"{where}: {name} stays at {value:g} from t = {first:.3f} to {last:.3f} "
                 f"while the car moves and other axes change: stuck or saturated{band}; {remedy}"
             )
+
+
+def check_repeated_fixes(gnss: Columns, where: str) -> None:
+    """No table in which most fixes of a moving car come again: a logger's that writes the last one at its own rate."""
+    t, values = gnss["t"], np.nan_to_num(stack_columns(gnss, ("lat_deg", "lon_deg", "height_m", *VELOCITY)))
+    first = np.flatnonzero(np.concatenate(([True], (np.diff(values, axis=0) != 0).any(1))))
+    way = np.abs(displacements(gnss["lat_deg"][first], gnss["lon_deg"][first]))
+    moves = (way > STEP_M) & (way > MOVING * np.diff(t[first]))
+    again = np.diff(first)[moves] > 1
+    if len(again) >= 3 and again.mean() > OFTEN:
+        k = int(first[:-1][moves][again][0])
+        raise InputError(
+            f"{where}: {100 * again.mean():.0f} % of the fixes of the moving car come several times (the one at "
+            f"t = {t[k]:.3f} again at {t[k + 1]:.3f}): keep the first row of each (dlkf.ingest gnss.rows=changed)"
+        )
 
 
 def _find_speeds(gnss: Columns) -> tuple[np.ndarray, np.ndarray]:

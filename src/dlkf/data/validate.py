@@ -13,7 +13,7 @@ from dlkf.base.errors import InputError
 from dlkf.data.aid_checks import check_aid
 from dlkf.data.aid_tables import STANDARD, AidTable
 from dlkf.data.bursts import MANY, share_at_once
-from dlkf.data.dead_sensors import check_frozen
+from dlkf.data.dead_sensors import check_frozen, check_repeated_fixes
 from dlkf.data.discovery.motion import find_motion
 from dlkf.data.limits import FULL_SCALE, NONE_REFUSED, Refused, screen_fixes, within_full_scale
 from dlkf.data.plausibility import check_clocks, check_gnss_units, check_imu_units
@@ -105,6 +105,7 @@ def check_tables(tables: CheckedTables, limits: Limits = LIMITS) -> CheckedTable
         tables = replace(tables, imu=imu, gnss=gnss, refused=refused)
     fixes = read_fixes(gnss)
     check_frozen(imu, fixes, _where(name, "imu"))
+    check_repeated_fixes(fixes, _where(name, "gnss"))
     check_turns(imu, fixes, _where(name, "imu"))
     check_clocks(imu, fixes, _where(name, "imu"))
     if truth is not None:
