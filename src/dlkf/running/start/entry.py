@@ -36,7 +36,7 @@ from dlkf.data.alignment import (
 )
 from dlkf.data.drive import Batch, Drive
 from dlkf.data.segments import whole_drives
-from dlkf.data.velocity_fit import JOLT_STD, NEEDED, scale_std
+from dlkf.data.velocity_fit import JOLT_STD, MOTION_SIGMAS, NEEDED, scale_std
 from dlkf.navigation.attitude import vector_from_rotation
 from dlkf.navigation.earth import EARTH_RATE, STANDARD_GRAVITY, ned_axes
 from dlkf.navigation.error_model import RATE_AVERAGE_S
@@ -228,6 +228,13 @@ def _first_motion(drive: Drive, config: AlignConfig, earliest: int) -> FirstMoti
         if len(apart) and (gap := float(apart.median())) > SLOWEST_FIXES_S * max(drive.epoch_s, 1.0):
             mend = f"set epoch_s={math.ceil(gap - SLACK_S)}" if gap <= SLOWEST_START_S else "leave the drive out"
             raise InputError(f"drive {drive.name}: fixes are {gap:g} s apart, a start needs {NEEDED}; {mend}")
+        speed, std = drive.gnss_v_e.norm(dim=-1), drive.gnss_std[:, 3:5].amax(-1)
+        fast = drive.gnss_valid[:, 3:].all(-1) & (speed > config.min_speed)
+        if bool(fast.any()) and bool((speed < MOTION_SIGMAS * std)[fast].double().mean() > 0.9):
+            raise InputError(
+                f"drive {drive.name}: velocities with a 1σ of {float(std[fast].median()):.3g} m/s do not show the course "
+                "of the car, so yaw is unknown; std_vel_* must be in m/s"
+            )
         raise InputError(
             f"drive {drive.name}: never moves faster than {config.min_speed:g} m/s for {config.window_s:g} s "
             "with GNSS, so yaw is unknown; lower align.min_speed or leave the drive out"
