@@ -232,8 +232,8 @@ def _first_motion(drive: Drive, config: AlignConfig, earliest: int) -> FirstMoti
         fast = drive.gnss_valid[:, 3:].all(-1) & (speed > config.min_speed)
         if bool(fast.any()) and bool((speed < MOTION_SIGMAS * std)[fast].double().mean() > 0.9):
             raise InputError(
-                f"drive {drive.name}: velocities with a 1σ of {float(std[fast].median()):.3g} m/s do not show the course"
-                ", so yaw is unknown; std_vel_* must be in m/s"
+                f"drive {drive.name}: velocities with a 1σ of {float(std[fast].median()):.3g} m/s do not show the "
+                "course, so yaw is unknown; std_vel_* must be in m/s"
             )
         raise InputError(
             f"drive {drive.name}: never moves faster than {config.min_speed:g} m/s for {config.window_s:g} s "
