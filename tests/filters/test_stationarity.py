@@ -29,7 +29,7 @@ from dlkf.filters.stationarity import (
 )
 from dlkf.filters.tuning import Tuning
 from dlkf.navigation.attitude import rotation_from_rpy, rotation_from_vector
-from dlkf.navigation.state import ACCEL, ATTITUDE, NavState
+from dlkf.navigation.state import ACCEL, ATTITUDE, VELOCITY, NavState
 from dlkf.navigation.strapdown import strapdown
 from dlkf.onboard.compiled_filter import compile_filter
 from dlkf.onboard.library import find_compiler
@@ -113,11 +113,9 @@ def test_a_car_that_pulls_away_in_an_outage_is_not_held_by_its_standstill(name):
     assert taken[:, 25:29].all() and not taken[:, 30:33].any()
 
 
-@pytest.mark.parametrize("last_force", [-1.3, -0.7])
-def test_a_rolling_stop_is_no_standstill(last_force):
-    """A car brakes at 0.7 m/s² from 0.75 to 0.05 m/s, as calm as at rest, and errors of tilt may explain that: a
-    standstill if the force was the same a second before, none if the car braked harder, or if nothing is learned of
-    it."""
+def second(before: float, after: float, force: float):
+    """A second in an outage in which the filter's speed changes so [m/s], with that force forward [m/s²]; P, in which
+    tilt may explain much; and the prior level."""
     seen = []
 
     class Seen(CarConstraints):
@@ -131,19 +129,45 @@ def test_a_rolling_stop_is_no_standstill(last_force):
     P = P.clone()
     P[:, ATTITUDE, ATTITUDE] = 0.06**2 * torch.eye(3, dtype=D)
     along, level = torch.tensor([[1.0, 0.0, 0.0]], dtype=D), torch.eye(3, dtype=D)[None]
-    start, end = (NavState(0 * along, v * along, level) for v in (0.75, 0.05))
-    force = torch.tensor([-0.7, 0.0, -9.8, 0.0, 0.0, 0.0], dtype=D)
+    start, end = (NavState(0 * along, v * along, level) for v in (before, after))
     noise = 1e-3 * torch.randn(1, M, 6, generator=torch.Generator().manual_seed(1), dtype=D)
     epoch = epoch._replace(
-        corrected=force + noise, error=epoch.error._replace(bias=0 * epoch.imu_error), start=start,
+        corrected=torch.tensor([force, 0.0, -9.8, 0.0, 0.0, 0.0], dtype=D) + noise,
+        error=epoch.error._replace(bias=0 * epoch.imu_error), start=start,
         window=epoch.window._replace(end=end), fix=epoch.fix._replace(used=epoch.used & False),
     )  # fmt: skip
+    return epoch, P, prior
+
+
+@pytest.mark.parametrize("last_force", [-1.3, -0.7])
+def test_a_rolling_stop_is_no_standstill(last_force):
+    """A car brakes at 0.7 m/s² from 0.75 to 0.05 m/s, as calm as at rest, and errors of tilt may explain that: a
+    standstill if the force was the same a second before, none if the car braked harder, or if nothing is learned of
+    it."""
+    epoch, P, prior = second(0.75, 0.05, -0.7)
     before = VibrationLevel.begin(scene(1, 1))._replace(moving=torch.tensor([0.1], dtype=D))
     before = before._replace(rest=before.rest._replace(last_force=torch.tensor([[last_force, 0.0]], dtype=D)))
-    stationary, *_ = detect_stationary(epoch, 0 * along, P, before, prior)
+    turning = torch.zeros(1, 3, dtype=D)
+    stationary, *_ = detect_stationary(epoch, turning, P, before, prior)
     assert stationary.item() == (last_force == -0.7)
     unlearned = before._replace(moving=torch.full_like(before.moving, math.inf))
-    assert not detect_stationary(epoch, 0 * along, P, unlearned, prior)[0].any()
+    assert not detect_stationary(epoch, turning, P, unlearned, prior)[0].any()
+
+
+@pytest.mark.parametrize("speed, calm_s, times_rest, expected", [
+    (0.3, 0.0, 2.0, True), (0.3, 0.0, 20.0, False), (0.15, 0.0, 20.0, True), (0.35, 5.0, 20.0, False),
+    (0.25, 5.0, 20.0, True), (0.6, 5.0, 2.0, True),
+])  # fmt: skip
+def test_a_level_of_creeping_is_a_standstill_at_a_smaller_speed(speed, calm_s, times_rest, expected):
+    """A car whose motion is a thousand times the level of its rest, with a 1σ of the speed of 0.1 m/s: up to ten times
+    that level 0.5 m/s, or 0.5 m/s + 3σ for two seconds, above 0.2 m/s, or 0.2 m/s + 1σ."""
+    epoch, P, prior = second(speed, speed, 0.0)
+    P[:, VELOCITY, VELOCITY] = 0.5 * 0.1**2 * torch.eye(3, dtype=D)
+    before = VibrationLevel.begin(scene(1, 1))
+    standing = before.second.update(epoch.corrected, epoch.dt)[1].level / times_rest
+    seconds = torch.tensor([calm_s], dtype=D)
+    before = before._replace(standing=standing, moving=1000 * standing, still_s=seconds, calm_s=seconds)
+    assert detect_stationary(epoch, torch.zeros(1, 3, dtype=D), P, before, prior)[0].item() == expected
 
 
 def test_a_force_that_changes_within_a_second_is_an_acceleration():

@@ -10,7 +10,9 @@ of at most 1 m/s where the two levels are not four times apart, since a smoother
 vibration has the same spread in both; then a standstill needs a speed below 0.5 m/s + 1σ, of which at most 0.5 m/s
 count, for minutes at constant speed show no acceleration and no turn either. So does one of a car of which nothing is
 learned, and there the filter's 1σ of tilt explains little of an acceleration. A speed above 0.5 m/s needs
-``DOUBTFUL_S``, for a car creeps as calmly for a second. Where a car has shaken as little for ``LONG_S`` as at a
+``DOUBTFUL_S``, for a car creeps as calmly for a second. A car that creeps shakes less than one that drives faster, so
+a level that is closer to motion than a third of the way, as logarithms, is that of a standstill only below 0.2 m/s
++ 1σ. Where a car has shaken as little for ``LONG_S`` as at a
 standstill, and far more in every second of motion so far, the filter's speed is wrong, within 20σ and 10 m/s: one event
 that its noise does not know spoils it so much.
 
@@ -47,6 +49,7 @@ STILL_ACCEL, STILL_RATE = 0.1, 0.01  # m/s², rad/s: with less, beyond the filte
 UNLEARNED_ACCEL = 0.3  # m/s²: at most so much of the filter's 2σ counts while nothing is learned of the car
 PLAUSIBLE_SPEED, PLAUSIBLE_SIGMAS = 0.5, 3.0  # m/s, 1σ: a standstill must not contradict the filter
 DOUBTFUL_SPEED = 1.0  # m/s, at most so much of 2σ where the samples separate the two, but not surely
+CREEPING_LEVEL_SPEED = 0.2  # m/s + 1σ, in place of 0.5 m/s + 3σ, where the level is between those of rest and motion
 PROVEN_S, PROVEN_SPEED = 3.0, 0.2  # s without acceleration or turn, m/s beyond 2σ: a standstill that fixes show
 # m/s: where the samples do not separate the two, a standstill needs a smaller 1σ of the speed
 SILENT_STD = 0.5
@@ -345,8 +348,10 @@ def detect_stationary(
     rest_s = torch.where(resting, before.rest_s + span, 0.0)
     after = after._replace(calm_s=calm_s, rest_s=rest_s)
     learned = ~(after.standing.isinf() & after.moving.isinf())
-    slow = (speed < PLAUSIBLE_SPEED) & (still_s > LEAST_S - 0.5 * span)
-    fastest = PLAUSIBLE_SPEED + _speed_doubt(std, learned & distinct, learned & surely)
+    between = surely & (level > after.resting_limit()) & ~after.standing.isinf()
+    least = torch.where(between, CREEPING_LEVEL_SPEED, PLAUSIBLE_SPEED)
+    slow = (speed < least) & (still_s > LEAST_S - 0.5 * span)
+    fastest = least + torch.where(between, std, _speed_doubt(std, learned & distinct, learned & surely))
     plausible = (speed < fastest) & (calm_s > DOUBTFUL_S - 0.5 * span)
     long = (speed < (LONG_SIGMAS * std).clamp_max(LONG_SPEED)) & (rest_s > LONG_S - 0.5 * span)
     stationary = calm & still & (slow | plausible) | long
