@@ -5,10 +5,10 @@
 From the first on, fixes get errors that the reported 1σ does not know: positions off by 3, 1 or 30 m (1σ per axis) in
 some seconds, by one error of 3 m for ten seconds about every 50 s, by 0.3, 1 or 3 m in all, or by 1 m that wanders over
 30 s; velocities off by 5 m/s in some, by 0.5 m/s in all, or those of a second before; or the receiver extrapolates for
-five seconds about every 50 s, or averages two positions. Or the IMU has a turn-on bias, of
-random direction, beside its own, gyroscopes whose scale factors are 1 or 3 % off, or biases that step. Or the files are
-wrong: stamps of fixes 0.1 or 0.3 s late, clocks 100 or 300 ppm apart, an antenna 1.4 m from where the lever arm says,
-one of 500 samples of a sensor spoiled.
+five seconds about every 50 s, its velocity as it was or noisy, or averages two positions. Or it says that ten seconds
+of fixes are worse. Or the IMU has a turn-on bias, of random direction, beside its own, gyroscopes whose scale factors
+are 1 or 3 % off, or biases that step. Or the files are wrong: stamps of fixes 0.1 or 0.3 s late, clocks 100 or 300 ppm
+apart, an antenna 1.4 m from where the lever arm says, one of 500 samples of a sensor spoiled.
 
 ``outages.md``: the outages of :mod:`pipelines.studies.plus` on real motion and on ``fleet``; the entirely real drives
 start on the wrong data, alone with biases (elsewhere the start is the truth with an error, which shows no bias). RMS /
@@ -81,16 +81,18 @@ def _single(share: float, size: float, count: int, g: torch.Generator) -> Tensor
     return (hit * size * torch.randn(LONGEST_S, 3, generator=g, dtype=torch.float64))[:count]
 
 
-def steps(size: float) -> Change:
-    """One error [m] of 1σ ``size`` per axis for ``LASTS_S`` seconds, again and again."""
+def steps(size: float, stated: float | None = None) -> Change:
+    """One error [m] of 1σ ``size`` per axis for ``LASTS_S`` seconds, again and again, ``stated`` as so much [m]."""
 
     def change(drive: Drive, g: torch.Generator) -> Drive:
-        r_e, k = drive.gnss_r_e.clone(), 0
+        r_e, std, k = drive.gnss_r_e.clone(), drive.gnss_std.clone(), 0
         while k < len(r_e):
             k += int(torch.randint(*EVERY_S, (1,), generator=g))
             r_e[k : k + LASTS_S] += size * torch.randn(3, generator=g, dtype=torch.float64)
+            if stated is not None:
+                std[k : k + LASTS_S, :3] = stated
             k += LASTS_S
-        return replace(drive, gnss_r_e=r_e)
+        return replace(drive, gnss_r_e=r_e, gnss_std=std)
 
     return change
 
@@ -124,8 +126,9 @@ def averaged(drive: Drive, g: torch.Generator) -> Drive:
     return replace(drive, gnss_r_e=r_e)
 
 
-def extrapolated(seconds: int) -> Change:
-    """Again and again fixes that continue the one before for so long, with its velocity or the one that led to it."""
+def extrapolated(seconds: int, noise: float = 0.0) -> Change:
+    """Again and again fixes that continue the one before for so long, with its velocity or the one that led to it, and
+    noise of the velocities [m/s]."""
 
     def change(drive: Drive, g: torch.Generator) -> Drive:
         r_e, v_e, k = drive.gnss_r_e.clone(), drive.gnss_v_e.clone(), 0
@@ -134,6 +137,8 @@ def extrapolated(seconds: int) -> Change:
             moves = drive.gnss_valid[k - 1, 3:].all()
             velocity = v_e[k - 1] if moves else (r_e[k - 1] - r_e[max(k - 2, 0)]) / drive.epoch_s
             r_e[k : k + seconds], v_e[k : k + seconds] = r_e[k - 1] + age * velocity, velocity
+            if noise:
+                v_e[k : k + seconds] += noise * torch.randn(len(age), 3, generator=g, dtype=torch.float64)
             k += seconds
         return replace(drive, gnss_r_e=r_e, gnss_v_e=v_e)
 
@@ -190,6 +195,8 @@ ERRORS: Mapping[str, Change] = {
     "3 % off": gyro_scale(0.03),
     "biases that step by 0.1 m/s², 0.15 °/s": bias_steps(0.1, 0.15),
     "fixes extrapolated for 5 s": extrapolated(5),
+    "the same, velocities with 3 cm/s of noise": extrapolated(5, 0.03),
+    "2 m for 10 s, stated as 2.5 m": steps(2.0, 2.5),
     "positions that are means of two fixes": averaged,
 }
 OF_VELOCITIES, OF_IMU = [*[*ERRORS][9:12], [*ERRORS][-1]], [*ERRORS][12:16]  # receivers with velocities; real drives
