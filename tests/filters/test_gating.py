@@ -119,7 +119,7 @@ def shifted(batch, epochs: slice, components: slice, by: float):
     return replace(batch, gnss=gnss)
 
 
-def hidden(batch, epochs: slice):
+def hidden(batch, epochs: slice | torch.Tensor):
     available = batch.available.clone()
     available[:, epochs] = False
     return replace(batch, available=available)
@@ -339,6 +339,8 @@ def test_a_step_that_lasts_some_seconds_is_not_followed():
     assert not early[:, 12].any() and early[:, 13:30].all()
     after = used(60, 90, hidden(batch, slice(48, 60)))
     assert after[:, 61:].all()
+    seldom = used(60, 68, hidden(batch, torch.arange(90) % 4 > 0))[:, ::4]
+    assert not seldom[:, 15:17].any() and seldom[:, 17:].all()
 
 
 def test_velocities_that_repeat_are_no_extrapolation_where_the_car_keeps_its_own():

@@ -44,7 +44,7 @@ from dlkf.navigation.state import POSITION, PV, VELOCITY
 
 PATIENCE = 2  # refused fixes in a row that agree with each other before the filter follows them
 HOLD_S, STEADY_S = 10.0, 20.0  # s that it does not, after so long with hardly a refusal
-REFUSAL_S = 5.0  # s, by which a refusal by itself shortens that time
+REFUSAL = 5.0  # intervals, by which a refusal by itself shortens that time
 AGREEMENT_SIGMAS, AGREEMENT_RATES = 6.0, (5.0, 2.0)  # two refusals agree within 6σ of the fixes + 5 m/s, 2 m/s² · time
 FLOOR = 0.05  # m, m/s added to 1σ of an innovation
 USUAL_STEP = 0.3  # per fix, by which the logarithm of the usual squared innovation follows
@@ -291,7 +291,8 @@ class Gate:
         passed = passed & (passed[:, :1] | ~offered[:, :1]) & ~held[:, 1:]
         passed = passed[:, OF_PART] & used
         good, late = seen & ~wrong, lost >= HOLD_S - 0.5 * span
-        gained = torch.where(good, span, torch.where(wrong & ~agrees, -REFUSAL_S, 0.0))
+        agreed = torch.where(memory.refused > 0, span, lost)
+        gained = torch.where(good, agreed, torch.where(wrong & ~agrees, -REFUSAL * span, 0.0))
         anew = follows | (good & late) | coasting.found
         steady = torch.where(anew, 0.0, (memory.steady + gained).clamp(0.0, 2 * STEADY_S))
         more = square > square.new_tensor(MEDIANS) * torch.exp(memory.usual)
