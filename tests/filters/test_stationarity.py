@@ -237,16 +237,18 @@ def test_a_smoother_road_than_any_before_is_no_standstill():
     assert taken[:, 2:9].any() and not taken[:, 31:].any()
 
 
-def test_the_uncertainty_of_an_acceleration_is_that_of_the_strapdown():
-    """Tilt C = exp([δh×]) Ĉ and bias errors of a stationary car, pushed through the strapdown one by one: the mean
-    acceleration of a second, with a covariance in which tilt and bias hang together."""
+@pytest.mark.parametrize("moves", [False, True])
+def test_the_uncertainty_of_an_acceleration_is_that_of_the_strapdown(moves):
+    """Tilt C = exp([δh×]) Ĉ and bias errors of a car that is stationary, or brakes in a bend, pushed through the
+    strapdown one by one: the mean acceleration of a second, with a covariance in which tilt and bias hang together."""
     base = scene(1, 1)
     C = rotation_from_rpy(torch.tensor([[0.1, -0.2, 0.7]], dtype=D))
     zero, g = torch.zeros(1, 3, dtype=D), base.frame.gravity(torch.zeros(1, 3, dtype=D))
+    force_n = torch.tensor([[-4.0 * moves, 3.0 * moves, 0.0]], dtype=D) - g
 
     def acceleration(tilt: torch.Tensor, bias: torch.Tensor) -> torch.Tensor:
         """Of the truth where the estimate stands still: its attitude is turned, its samples have that much less."""
-        force = (-(C.mT @ g[..., None])[..., 0] - bias).expand(1, M, 3)
+        force = ((C.mT @ force_n[..., None])[..., 0] - bias).expand(1, M, 3)
         state = NavState(zero, zero, rotation_from_vector(tilt) @ C)
         return strapdown(state, torch.cat((force, 0 * force), -1), base.dt, base.frame).end.v_n[0, :2]
 
@@ -258,7 +260,7 @@ def test_the_uncertainty_of_an_acceleration_is_that_of_the_strapdown():
     P = (A @ A.mT)[None]
     of = [*range(*ATTITUDE.indices(15)), *range(*ACCEL.indices(15))]
     expected = (J @ P[0][of][:, of] @ J.mT).trace().sqrt()
-    torch.testing.assert_close(acceleration_std(P, C)[0], expected, rtol=2e-3, atol=0)
+    torch.testing.assert_close(acceleration_std(P, C, force_n if moves else None)[0], expected, rtol=2e-3, atol=0)
 
 
 def found(batch, name: str = "mbkf15_nhc", **tuning: float):

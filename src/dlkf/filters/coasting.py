@@ -19,7 +19,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dlkf.filters.integration import Epoch
-from dlkf.navigation.attitude import skew
+from dlkf.filters.stationarity import acceleration_std
 from dlkf.navigation.earth import STANDARD_GRAVITY
 from dlkf.navigation.state import ACCEL, ATTITUDE
 
@@ -37,8 +37,8 @@ class Coasting(NamedTuple):
     velocity: Tensor  # (B, 2) m/s, of that fix, or between it and the one before; NaN: none
     measured: Tensor  # (B,) bool: that fix has a velocity
     age: Tensor  # (B,) s since that fix
-    gained: Tensor  # (B, 2) m/s, by the INS since the first fix with it
     lead: Tensor  # (B, 2) m/s, of the INS's velocity at the end of the last window over its mean in it
+    gained: Tensor  # (B, 2) m/s, by the INS since the first fix with that velocity
     std: Tensor  # (B,) m/s, 1σ of that
     found: Tensor  # (B, 2) bool: position and velocity of the last fix are no measurements
 
@@ -62,7 +62,8 @@ class Coasting(NamedTuple):
         mean = (end.p_n - start.p_n)[:, :2] / epoch.span_s  # of the INS, as ``between`` is one
         at_ends, of_means = (end.v_n - start.v_n)[:, :2], mean - start.v_n[:, :2] + self.lead
         gained = self.gained + torch.where(of_fix.unsqueeze(-1), at_ends, of_means)
-        std = self.std + epoch.span_s * _acceleration_std(epoch, P)  # an error of tilt stays
+        force_n = torch.bmm(end.C_nb, epoch.corrected[..., :3].mean(1).unsqueeze(-1)).squeeze(-1)
+        std = self.std + epoch.span_s * acceleration_std(P, end.C_nb, force_n)  # an error of tilt stays
 
         change = (velocity - self.velocity).norm(dim=-1)
         same = fixed & recent & (change < torch.where(measured, SAME, STRAIGHT / age))
@@ -71,8 +72,8 @@ class Coasting(NamedTuple):
         f, new = fixed.unsqueeze(-1), fixed & ~same
         return Coasting(
             torch.where(f, place, self.place), torch.where(f, velocity, self.velocity), of_fix,
-            torch.where(fixed, 0.0, age), torch.where(new.unsqueeze(-1), 0.0, gained), end.v_n[:, :2] - mean,
-            torch.where(new, 0.0, std),
+            torch.where(fixed, 0.0, age), end.v_n[:, :2] - mean,
+            torch.where(new.unsqueeze(-1), 0.0, gained), torch.where(new, 0.0, std),
             torch.where(epoch.used.any(-1, keepdim=True), torch.stack((stale & along, stale), 1), self.found),
         )  # fmt: skip
 
@@ -84,12 +85,3 @@ def acceleration_variance(epoch: Epoch, P: Float[Tensor, "B n n"]) -> Float[Tens
     force = epoch.corrected[..., :2].mean(1).square().sum(-1)
     tilt, heading = variance[:, ATTITUDE][:, :2].amax(-1), variance[:, ATTITUDE][:, 2]
     return STANDARD_GRAVITY**2 * tilt + force * heading + variance[:, ACCEL].amax(-1)
-
-
-def _acceleration_std(epoch: Epoch, P: Float[Tensor, "B n n"]) -> Float[Tensor, " B"]:
-    """Of the INS's horizontal acceleration [m/s²], δa = f × δh + C ε: tilt and biases, which may cancel each other."""
-    C = epoch.window.end.C_nb
-    force_n = torch.bmm(C, epoch.corrected[..., :3].mean(1).unsqueeze(-1)).squeeze(-1)
-    J = torch.cat((skew(force_n), C), -1)[:, :2]
-    wrong = slice(ATTITUDE.start, ACCEL.stop)
-    return torch.einsum("bij,bjk,bik->b", J, P[:, wrong, wrong], J).clamp_min(0.0).sqrt()

@@ -34,6 +34,7 @@ from torch import Tensor
 
 from dlkf.data.drive import Batch
 from dlkf.filters.integration import Epoch
+from dlkf.navigation.attitude import skew
 from dlkf.navigation.earth import NOMINAL_GRAVITY
 from dlkf.navigation.state import ACCEL, ATTITUDE, GYRO, VELOCITY
 
@@ -370,12 +371,16 @@ def _speed_doubt(
     return torch.where(surely, PLAUSIBLE_SIGMAS * std, doubt)
 
 
-def acceleration_std(P: Float[Tensor, "B n n"], C_nb: Float[Tensor, "B 3 3"]) -> Float[Tensor, " B"]:
-    """1σ of the horizontal acceleration [m/s²]: δa = f × δh + C ε with f of a car that hardly accelerates. At a
-    standstill tilt and bias cancel each other."""
+def acceleration_std(
+    P: Float[Tensor, "B n n"], C_nb: Float[Tensor, "B 3 3"], force_n: Float[Tensor, "B 3"] | None = None
+) -> Float[Tensor, " B"]:
+    """1σ of the horizontal acceleration [m/s²], δa = f × δh + C ε: tilt and bias may cancel each other.
+
+    Without a specific force, that of a car that hardly accelerates.
+    """
     g = NOMINAL_GRAVITY
-    gravity = C_nb.new_tensor(((0.0, g), (-g, 0.0))).expand(len(C_nb), 2, 2)
-    J = torch.cat((gravity, C_nb[:, :2]), -1)  # tilt, accelerometers
-    tilt, accel = P[:, ATTITUDE][:, :2], P[:, ACCEL]
-    rows = (torch.cat((x[:, :, ATTITUDE][..., :2], x[:, :, ACCEL]), -1) for x in (tilt, accel))
-    return torch.einsum("bij,bjk,bik->b", J, torch.cat(tuple(rows), 1), J).clamp_min(0.0).sqrt()
+    of_attitude = C_nb.new_tensor(((0.0, g, 0.0), (-g, 0.0, 0.0))).expand(len(C_nb), 2, 3)
+    if force_n is not None:
+        of_attitude = skew(force_n)[:, :2]
+    J, wrong = torch.cat((of_attitude, C_nb[:, :2]), -1), slice(ATTITUDE.start, ACCEL.stop)
+    return torch.einsum("bij,bjk,bik->b", J, P[:, wrong, wrong], J).clamp_min(0.0).sqrt()

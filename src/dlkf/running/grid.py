@@ -17,7 +17,7 @@ from dlkf.filters.aids.attach import find_kalman
 from dlkf.filters.constraints import CarConstraints
 from dlkf.filters.saved import choose_grid
 from dlkf.filters.smoother import Filter
-from dlkf.running.start.entry import SLACK_S, SLOWEST_FIXES_S, SLOWEST_START_S
+from dlkf.running.start.no_motion import SLACK_S, SLOWEST_FIXES_S, SLOWEST_START_S
 
 
 @dataclass(frozen=True)

@@ -36,7 +36,7 @@ from dlkf.data.alignment import (
 )
 from dlkf.data.drive import Batch, Drive
 from dlkf.data.segments import whole_drives
-from dlkf.data.velocity_fit import JOLT_STD, MOTION_SIGMAS, NEEDED, scale_std
+from dlkf.data.velocity_fit import JOLT_STD, scale_std
 from dlkf.navigation.attitude import vector_from_rotation
 from dlkf.navigation.earth import EARTH_RATE, STANDARD_GRAVITY, ned_axes
 from dlkf.navigation.error_model import RATE_AVERAGE_S
@@ -55,6 +55,7 @@ from dlkf.running.start.bank import (
     judge_bank,
     yaw_std,
 )
+from dlkf.running.start.no_motion import explain_no_motion
 from dlkf.running.start.standstill import (
     Gyros,
     carry_attitude_back,
@@ -69,7 +70,6 @@ WORST_HEADING_STD = math.radians(10)  # a start further back would be worth less
 REST_VELOCITY_STD = 0.05  # m/s
 STALE_ACCELERATION = 2.0  # m/s², by which the velocity of a late fix may be off
 LOOKBACK_S = 12.0  # of samples and fixes that a start without look-ahead reads
-SLOWEST_FIXES_S, SLOWEST_START_S, SLACK_S = 2.5, 10.0, 0.05  # between fixes, with intervals of a second, any; jitter
 FIRST_EPOCHS = 128  # that are aligned at first; four times as many where the car does not move in them
 CASES_AT_ONCE = 32  # bounds the memory
 
@@ -224,21 +224,7 @@ def _first_motion(drive: Drive, config: AlignConfig, earliest: int) -> FirstMoti
         raise InputError(f"drive {drive.name}: no GNSS fix inside the IMU's time; a filter cannot start")
     aligned, row = _align_until_motion(drive, config, earliest)
     if row is None:
-        apart = torch.nonzero(drive.gnss_valid[:, :3].all(-1)).flatten().diff().double() * drive.epoch_s
-        if len(apart) and (gap := float(apart.median())) > SLOWEST_FIXES_S * max(drive.epoch_s, 1.0):
-            mend = f"set epoch_s={math.ceil(gap - SLACK_S)}" if gap <= SLOWEST_START_S else "leave the drive out"
-            raise InputError(f"drive {drive.name}: fixes are {gap:g} s apart, a start needs {NEEDED}; {mend}")
-        speed, std = drive.gnss_v_e.norm(dim=-1), drive.gnss_std[:, 3:5].amax(-1)
-        fast = drive.gnss_valid[:, 3:].all(-1) & (speed > config.min_speed)
-        if bool(fast.any()) and bool((speed < MOTION_SIGMAS * std)[fast].double().mean() > 0.9):
-            raise InputError(
-                f"drive {drive.name}: velocities with a 1σ of {float(std[fast].median()):.3g} m/s do not show the "
-                "course, so yaw is unknown; std_vel_* must be in m/s"
-            )
-        raise InputError(
-            f"drive {drive.name}: never moves faster than {config.min_speed:g} m/s for {config.window_s:g} s "
-            "with GNSS, so yaw is unknown; lower align.min_speed or leave the drive out"
-        )
+        raise InputError(f"drive {drive.name}: {explain_no_motion(drive, config)}")
     C_eb, std = aligned.C_eb[row], aligned.std[row, 6:]
     rest = torch.zeros(drive.epochs, dtype=torch.bool)
     if config.search_s > 0 or config.from_rest:
