@@ -13,6 +13,7 @@ from dlkf.filters.tuning import Tuning
 
 from .scene import IMU, scene
 from .test_constraints import slipping
+from .test_stationarity import steady
 
 D = torch.float64
 
@@ -76,6 +77,16 @@ def test_a_receiver_that_froze_stays_frozen_while_the_car_stands():
     off = error(replace(batch, gnss=gnss), "mbkf15_nhc_gated")
     stale = (batch.gnss[:, 37] - batch.gnss[:, 79])[:, :3].norm(dim=-1)
     assert stale.min() > 50.0 and off[:, 79].max() < 0.4 * stale.min()
+
+
+@pytest.mark.parametrize("name", ["mbkf15", "mbkf21_car", "mbkf33_car_gated"])
+def test_a_velocity_that_a_receiver_holds_at_zero_is_known_to_its_limit(name):
+    """Cars that creep at 0.3 to 0.5 m/s under positions of centimetres: their velocity is that of the positions."""
+    batch = steady((0.3, 0.4, 0.5), 60)
+    gnss, std = batch.gnss.clone(), batch.gnss_std.clone()
+    gnss[..., 3:], std[..., 3:] = 0.0, 0.05
+    velocity = integrate(replace(batch, gnss=gnss, gnss_std=std), build_filter(name, IMU)).posterior.v_n
+    assert (velocity - batch.truth.v_n)[:, 35:].norm(dim=-1).mean(1).max() < 0.09
 
 
 def test_recovers_by_itself_after_a_long_gap():

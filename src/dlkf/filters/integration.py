@@ -20,8 +20,11 @@ from dlkf.filters.advice import NetworkOutput
 from dlkf.navigation.calibration import ImuError
 from dlkf.navigation.earth import TangentFrame
 from dlkf.navigation.error_model import ARM_RATE_S, RATE_AVERAGE_S, antenna
-from dlkf.navigation.state import NavState
+from dlkf.navigation.state import VELOCITY, NavState
 from dlkf.navigation.strapdown import Window, strapdown
+
+
+HELD_STD = 0.3  # m/s: 1σ of a speed below that at which a receiver begins to hold its fix, 0.5 m/s as a rule
 
 
 class Fix(NamedTuple):
@@ -33,6 +36,13 @@ class Fix(NamedTuple):
     lag: Tensor | None  # (B,) s before the epoch's end; None: all on it
     aids: Mapping[str, Tensor] | None = None  # (B, 5) of further sensors by name, see dlkf.data.aids.ROW
     velocity_lag: Tensor | None = None  # (B,) as lag, of the velocity; of an epoch of filters that estimate it
+
+    def widen_held_velocity(self) -> Fix:
+        """With a 1σ of at least ``HELD_STD`` for a velocity of exactly zero, which is none that a receiver measures:
+        with static hold it gives zero for any speed below some limit, and a car may creep."""
+        held = self.used[:, 3:5].all(-1, keepdim=True) & (self.value[:, 3:5] == 0).all(-1, keepdim=True)
+        velocity = torch.where(held, self.std[:, VELOCITY].clamp_min(HELD_STD), self.std[:, VELOCITY])
+        return self._replace(std=torch.cat((self.std[:, : VELOCITY.start], velocity), -1))
 
 
 class Epoch(NamedTuple):
@@ -169,6 +179,7 @@ def advance(
     """One epoch: strapdown over its samples (B, M, 6), innovation, the estimator's answer, feedback."""
     if isinstance(estimator, WholeLoop):
         return estimator.advance(memory, imu, fix, frame)
+    fix = fix.widen_held_velocity()
     corrected = error.correct(imu)
     window = strapdown(state, corrected, dt, frame)
     prior = window.end
