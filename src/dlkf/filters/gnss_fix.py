@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dlkf.data.drive import Batch
+from dlkf.filters import slow_errors
 from dlkf.filters.adaptive import AdaptiveNoise
 from dlkf.filters.gating import CoarseMemory, FixGate, GateMemory
 from dlkf.filters.integration import Epoch
@@ -69,7 +70,9 @@ class GnssFix:
         H = measurement_matrix(epoch.at_fix, epoch.rate_at_fix_b, epoch.lever_arm_b, epoch.frame, self.states.count)
         if epoch.fix.lag is not None:
             H = _look_back(H, epoch, epoch.fix.lag)
-        return add_columns(H, epoch, self.states) if has_receiver(self.states) else H
+        if has_receiver(self.states):
+            H = add_columns(H, epoch, self.states)
+        return slow_errors.add_columns(H, self.states) if slow_errors.has_slow_errors(self.states) else H
 
 
 def _look_back(H: Float[Tensor, "B 6 n"], epoch: Epoch, lag: Float[Tensor, " B"]) -> Float[Tensor, "B 6 n"]:

@@ -29,6 +29,7 @@ from dlkf.filters.receiver import (
     predict_fix,
     widen_start,
 )
+from dlkf.filters.slow_errors import has_slow_errors, subtract_slow_errors
 from dlkf.filters.sources import Measurement, Parameter, Predicted, Source, describe_aid, predicted_variance
 from dlkf.filters.tuning import Prior, Tuning
 from dlkf.navigation.calibration import ImuError
@@ -214,14 +215,15 @@ class Mbkf:
             return torch.where(rejected, predicted_variance(c.predicted, H) + R, 0.0)
 
     def predict_fix(self, memory: KalmanMemory, epoch: Epoch) -> tuple[KalmanMemory, Epoch]:
-        """At the end of an update interval: the delay of the fixes has grown, and the innovation is that which delay
-        and antenna give, where the filter estimates them."""
-        if memory.parameters is None or not has_receiver(self.states):
-            return memory, epoch
-        seconds = epoch.span_s
-        P, parameters = let_delay_grow(memory.P, memory.parameters, self.states, seconds)
-        memory = memory._replace(P=P, parameters=parameters)
-        return memory, predict_fix(epoch, self._name_parameters(parameters))
+        """At the end of an update interval: the delay of the fixes has grown, and the innovation is that which delay,
+        antenna and slow errors give, where the filter estimates them."""
+        if memory.parameters is not None and has_receiver(self.states):
+            P, parameters = let_delay_grow(memory.P, memory.parameters, self.states, epoch.span_s)
+            memory = memory._replace(P=P, parameters=parameters)
+            epoch = predict_fix(epoch, self._name_parameters(parameters))
+        if memory.parameters is not None and has_slow_errors(self.states):
+            epoch = subtract_slow_errors(epoch, self._name_parameters(memory.parameters))
+        return memory, epoch
 
     def screen_fix(self, memory: KalmanMemory, epoch: Epoch) -> tuple[KalmanMemory, Epoch]:
         """Memory and epoch after the gate of its fixes."""
