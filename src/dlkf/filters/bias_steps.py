@@ -42,8 +42,7 @@ class BiasSteps(NamedTuple):
 
     def walk_factors(self) -> Float[Tensor, "B 2 3"]:
         """On the 1σ of the walks, of accelerometers and gyroscopes by axis; at least 1."""
-        t = self.total / self.weight.sqrt()
-        return (t.abs() / LIMIT).clamp_min(1.0).pow(POWER).unflatten(-1, (2, 3))
+        return widen_walk(self.total / self.weight.sqrt()).unflatten(-1, (2, 3))
 
     def update(self, c: Covariances, interval_s: Float[Tensor, " B"], fixed: Bool[Tensor, " B"]) -> BiasSteps:
         """After the correction of an epoch, ``interval_s`` after the last fix; unchanged without a fix."""
@@ -55,3 +54,8 @@ class BiasSteps(NamedTuple):
             torch.where(fixed, keep * self.total + e, self.total),
             torch.where(fixed, keep.square() * self.weight + 1, self.weight),
         )
+
+
+def widen_walk(t: Float[Tensor, "B n"]) -> Float[Tensor, "B n"]:
+    """Factors on the 1σ of walks; at least 1."""
+    return (t.abs() / LIMIT).clamp_min(1.0).pow(POWER)

@@ -9,6 +9,11 @@ over the last ``MEMORY`` fixes in motion, sideways and down apart, would be 1 fo
 But what roads and tyres do lasts for seconds, and the σ that is best in outages is larger: with m between ``LOW`` and
 ``HIGH`` it fits. Beyond, the variance is σ² m/HIGH or σ² m/LOW, within ``LEAST`` and ``MOST`` times σ². z² is capped at
 9 (H P Hᵀ + f σ²), f the factor in force.
+
+The mean itself shows a mount that has turned: an IMU that is not bolted down, a phone in its holder. Its innovations
+keep their sign until the filter has found the new mounting, whose states hardly walk; the biases would take it instead.
+So the sign is tested as that of the corrections of a bias (:mod:`dlkf.filters.bias_steps`), with e = z/√(H P Hᵀ + σ²),
+and the walks of mounting yaw (sideways) and pitch (down) are multiplied as theirs.
 """
 
 from __future__ import annotations
@@ -18,6 +23,8 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+
+from dlkf.filters import bias_steps
 
 FIRST, EXPECTED = 10.0, 0.25  # fixes for which a mean of so much counts at the start
 MEMORY = 300.0  # fixes
@@ -30,17 +37,28 @@ class ConstraintNoise(NamedTuple):
 
     squares: Tensor  # (B, 2) of z² over its variance, sideways and down
     fixes: Tensor  # (B, 1) how many, those long ago less
+    total: Tensor  # (B, 2) Σ fⁿ⁻ᵏ e
+    weight: Tensor  # (B, 1) Σ f²⁽ⁿ⁻ᵏ⁾
 
     @classmethod
     def begin(cls, like: Tensor, batch_size: int) -> ConstraintNoise:
         """Before the first fix."""
-        return cls(like.new_zeros(batch_size, 2), like.new_zeros(batch_size, 1))
+        zeros = like.new_zeros
+        return cls(
+            zeros(batch_size, 2), zeros(batch_size, 1), zeros(batch_size, 2),
+            zeros(batch_size, 1) + bias_steps.MEMORY / 2,
+        )  # fmt: skip
 
     @property
     def factor(self) -> Float[Tensor, "B 2"]:
         """On the variance of the rows."""
         mean = (FIRST * EXPECTED + self.squares) / (FIRST + self.fixes)
         return torch.maximum(mean / HIGH, (mean / LOW).clamp_max(1.0)).clamp(LEAST, MOST)
+
+    @property
+    def walk_factors(self) -> Float[Tensor, "B 2"]:
+        """On the 1σ of the walks of mounting yaw and pitch; at least 1."""
+        return bias_steps.widen_walk(self.total / self.weight.sqrt())
 
     def update(
         self,
@@ -56,4 +74,10 @@ class ConstraintNoise(NamedTuple):
         keep = 1 - counts / MEMORY
         most = sigmas**2 * (of_state + self.factor * variance)
         square = torch.minimum(z.square(), most) / (of_state + variance)
-        return ConstraintNoise(keep * self.squares + counts * square, keep * self.fixes + counts)
+        most = bias_steps.LARGEST
+        e = (z / (of_state + variance).sqrt()).clamp(-most, most)
+        left = 1 - counts / bias_steps.MEMORY
+        return ConstraintNoise(
+            keep * self.squares + counts * square, keep * self.fixes + counts,
+            left * self.total + counts * e, left.square() * self.weight + counts,
+        )  # fmt: skip

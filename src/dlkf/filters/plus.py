@@ -27,6 +27,7 @@ from dlkf.base.errors import InputError
 from dlkf.base.settings import settings_from
 from dlkf.data.drive import Batch
 from dlkf.filters.advice import NetworkOutput
+from dlkf.filters.aids.attach import add_sources
 from dlkf.filters.bias_steps import BiasSteps
 from dlkf.filters.branches import may_branch
 from dlkf.filters.build import build_filter
@@ -44,12 +45,13 @@ from dlkf.filters.matching import (
 from dlkf.filters.model_based import KalmanMemory as KalmanMemory
 from dlkf.filters.model_based import Mbkf
 from dlkf.filters.position_errors import PositionErrors
+from dlkf.filters.slow_errors import NAMES, SlowErrors
 from dlkf.filters.tuning import Tuning
 from dlkf.filters.virtual_outages import VirtualOutage
 from dlkf.navigation.calibration import ImuError
 from dlkf.navigation.error_model import source_scale
 from dlkf.navigation.imu_errors import ImuSpec, imu_spec
-from dlkf.navigation.state import IMU, POSITION, PVA
+from dlkf.navigation.state import IMU, PVA
 from dlkf.networks.features import level_rotation
 from dlkf.networks.plus import (
     LEAST_RATE_HZ,
@@ -131,7 +133,8 @@ class PlusFilter(nn.Module):
                 f"model.base={config.base} is no Kalman filter that plus can stand on; take {PlusConfig.base}"
             )
         sources = tuple(replace(s, adapts_noise=True) if isinstance(s, CarConstraints) else s for s in kalman.sources)
-        self.kalman = replace(kalman, sources=sources, cut_transition=True, heavy_tails=True)
+        kalman = replace(kalman, sources=sources, cut_transition=True, heavy_tails=True)
+        self.kalman = add_sources(kalman, [SlowErrors])
         count = self.kalman.states.base.count
         now = 3 + 3 + 3 + 2 + 6
         features = WINDOW_FEATURES + count + (count - 9) + 2 + 4 + 6 + LOG_FEATURES + 4 + now
@@ -184,12 +187,22 @@ class PlusFilter(nn.Module):
     def step(self, memory: PlusMemory, epoch: Epoch) -> tuple[PlusMemory, Correction]:
         """Network, the Kalman filter with the noise of both, then the virtual outage beside it."""
         span = epoch.span_s
-        kalman, claimed = self.kalman.predict_fix(memory.kalman, epoch)
+        slow, first = self.states.of(NAMES[0]).start, self.states.of_others.start
+        errors, change = memory.errors.advance(epoch, memory.since_fix)
+        kalman, outage = memory.kalman, memory.outage
+        assert kalman.parameters is not None
+        parameters = change.shrink(kalman.parameters, slow - first)
+        kalman = kalman._replace(P=change.propagate(kalman.P, slow), parameters=parameters)
+        outage = outage._replace(
+            P=change.propagate(outage.P, slow, follows=False), drift=change.shrink(outage.drift, slow)
+        )
+        kalman, claimed = self.kalman.predict_fix(kalman, epoch)
+        for source, of_source in zip(self.kalman.sources, kalman.sources, strict=True):
+            if isinstance(source, CarConstraints):
+                kalman = kalman._replace(P=source.let_mounting_turn(kalman.P, of_source, claimed))
         offered = memory.fix_noise.inflate_fix(claimed)
         kalman, epoch = self.kalman.screen_fix(kalman, offered)
-        walk = torch.diag_embed(memory.errors.variance(offered))
-        outage = memory.outage._replace(P=_add_walk(memory.outage.P, walk))
-        memory = memory._replace(kalman=kalman._replace(P=_add_walk(kalman.P, walk)), outage=outage)
+        memory = memory._replace(kalman=kalman, outage=outage, errors=errors)
         fixed, interval = epoch.used.any(-1), memory.since_fix + span
         with torch.no_grad():
             normalised = self._normalise_innovation(memory, epoch)
@@ -225,9 +238,13 @@ class PlusFilter(nn.Module):
             fix_noise, steps = memory.fix_noise, memory.steps
             if (c := correction.covariances) is not None:
                 scale = source_scale(of_network, epoch.start.C_nb)
+                c = c._replace(Phi=change.add_decay(c.Phi, slow))
+                correction = correction._replace(covariances=c)
                 outage = outage.update(epoch, c, memory.kalman.windows, scale)
                 offering = c._replace(H=self.kalman.fix.matrix(claimed))  # before the gate
-                errors, fix_noise = errors.update(offered, offering), fix_noise.update(claimed, offering, outage)
+                estimated, corrected = parameters[:, slow - first :][:, :3], c.dx[:, slow : slow + 3]
+                errors = errors.update(offered, offering, estimated, corrected)
+                fix_noise = fix_noise.update(claimed, offering, outage)
                 matching = matching.update_ratios(c.dx, c.predicted, c.updated, epoch.window.end.C_nb, fixed)
                 steps = steps.update(c, interval, fixed)
         if correction.std is not None:
@@ -282,13 +299,6 @@ class PlusFilter(nn.Module):
         return like.new_tensor(
             (1.0,) * 3 + (0.3,) * 3 + (0.02,) * 3 + (0.1,) * 3 + (0.005,) * 3 + (0.005,) * matrix + car
         )
-
-
-def _add_walk(P: Float[Tensor, "B n n"], walk: Float[Tensor, "B 3 3"]) -> Float[Tensor, "B n n"]:
-    """P after a random walk of the position."""
-    P = P.clone()
-    P[:, POSITION, POSITION] += walk
-    return P
 
 
 def _to_plain(values: Mapping[str, Any]) -> dict[str, Any]:

@@ -32,6 +32,10 @@ COLUMNS = {  # of a row, at the IMU; before the last part of a name that is an a
     "lever_forward_m": "antenna further forward than the lever arm says [m]",
     "lever_right_m": "antenna further to the right than the lever arm says [m]",
     "lever_down_m": "antenna further down than the lever arm says [m]",
+    **{
+        f"position_error_{axis}_m": f"slow error of the receiver's positions, {axis} [m]"
+        for axis in ("north", "east", "down")
+    },
 }
 SENSOR = {  # of a further sensor, after its name
     "_innovation": "sample of the sensor {} less expected, in its unit",
@@ -110,6 +114,8 @@ MEMORY = {  # by the last parts of a field's name
     "blocks": "blocks in both",
     "evidence": "evidence for each share of the vibration's likelihood [nats]",
     "age": "time since the last fix [s]",
+    "noise.total": "fading sum of innovations across the car over their 1σ, sideways and down",
+    "noise.weight": "fading sum of the squares of its weights",
     "noise.squares": "sum over fixes in motion of innovation² over its variance with the 1σ as set, sideways and down",
     "noise.Q": "adapted covariance of an epoch's process noise, units of P",
     "noise.R": "adapted variance of a fix: position [m²], velocity [m²/s²]",
@@ -175,6 +181,8 @@ MEMORY = {  # by the last parts of a field's name
     "errors.slow": "variance of the last position that is not white [m²]",
     "errors.last": "variance of the last position as claimed, horizontal and down [m²]",
     "errors.usual": "the usual one [m²]; inf: none yet",
+    "errors.modelled": "variance of the slow errors as states, of that of a usual position",
+    "errors.fixed_s": "time since the first fix, or the first one after an outage [s]",
     "fix_noise.apart": "positions of the last three fixes less those of the virtual outage [m], the latest first",
     "fix_noise.residual": "velocity of the last fix less the filter's estimate after it [m/s]",
     "fix_noise.successive": "fixes in successive epochs, by part of a fix",
