@@ -104,7 +104,19 @@ def summary_lines(model: str, courses: Sequence[TrackOnMap]) -> list[str]:
     refused = [f"{c.result.refused} of {c.result.drive}" for c in courses if any(c.result.refused)]
     more = f" and of {len(refused) - FEW_NAMED} more drives" if len(refused) > FEW_NAMED else ""
     said = [f"Rejected as implausible: {', '.join(refused[:FEW_NAMED])}{more}."] if refused else []
+    lost = [f"{times(len(c.result.restarts))} in {c.result.drive}" for c in courses if c.result.restarts]
+    if lost:
+        more = f" and in {len(lost) - FEW_NAMED} more drives" if len(lost) > FEW_NAMED else ""
+        said.append(
+            f"The filter was lost and started over {', '.join(lost[:FEW_NAMED])}{more}: positions, velocities and IMU "
+            "contradict each other there."
+        )
     return [lead, text, *vibration_lines(courses), *said]
+
+
+def times(count: int) -> str:
+    """1 → "once", 3 → "3 times"."""
+    return "once" if count == 1 else f"{count} times"
 
 
 def vibration_lines(courses: Sequence[TrackOnMap]) -> list[str]:

@@ -23,6 +23,7 @@ from dlkf.filters.aids.attach import aid_columns
 from dlkf.filters.aids.estimates import describe_estimate
 from dlkf.filters.integration import BatchSolution, WholeLoop
 from dlkf.filters.receiver import ARM, DELAY, DRIFT, VELOCITY_DELAY
+from dlkf.filters.slow_errors import NAMES as PASSING
 from dlkf.filters.smoother import Filter, SmoothedSolution
 from dlkf.navigation.compiled import without_loops
 from dlkf.running.batched import CHUNK_SAMPLES, pack, run_filter
@@ -89,7 +90,7 @@ class Navigated:
             text += f", rejected as implausible: {self.refused}"
         if self.restarts:
             text += ", lost and started over at t = " + ", ".join(self._describe_restart(t) for t in self.restarts[:5])
-            text += " s"
+            text += " s" + (f" and {more} times more" if (more := len(self.restarts) - 5) > 0 else "")
         return text
 
     def _describe_restart(self, t: float) -> str:
@@ -132,6 +133,8 @@ class Navigated:
         for std in (column for column in self.sensor_columns if column.startswith("std_")):
             name, last = std.removeprefix("std_"), table.iloc[-1]
             floor = OF_RECEIVER.get(name)
+            if name in PASSING:
+                continue
             if floor is not None and abs(last[name]) <= SIGMAS * np.hypot(last[std], floor):
                 continue
             said[name] = describe_estimate(name, last[name], last[std])
