@@ -25,6 +25,8 @@ from dlkf.navigation.earth import SEMI_MAJOR
 FORCE, UPRIGHT = (7.0, 13.0), 0.7  # m/s², the median specific force; the share of it along −z
 FASTEST_RATE = 20.0  # rad/s: no car turns, and no bump shakes it, that fast for a thousandth of a drive
 DISAGREES, AGREES = 0.4, 0.25  # relative residual of way against velocity
+UNRELATED = 0.8  # of that: the velocities explain nothing of the way
+MOVING, RADIANS_DEG = 3.0, 6.5  # m/s; courses in radians that were read as degrees are less
 SUSPECT, CLEARLY = 0.15, 0.25  # less than DISAGREES, but more than a quarter of which another reading has
 MOVED_M = 100.0  # positions of a car that moves
 UNITS = (  # that velocities may be in, the remedy, m/s per unit
@@ -71,8 +73,8 @@ def check_imu_units(imu: Columns, where: str) -> None:
     if axes[2] > UPRIGHT * size:
         raise InputError(
             f"{where}: accel_z is {axes[2]:+.2f} m/s² in the median, must be about −9.8 (Forward-Right-"
-            "Down); the z axis points up (FLU?): reader.imu.accel.axes=flu and gyro.axes=flu, or negate y and z of "
-            "accel and gyro"
+            "Down): the z axis points up; reader.imu.accel.axes and gyro.axes=auto (flu of a log as recorded, frd of "
+            "one that was read as flu), or negate y and z of accel and gyro"
         )
     if axes[2] > -UPRIGHT * size:
         k = int(np.abs(axes).argmax())
@@ -147,7 +149,7 @@ def _check_places(lat: np.ndarray, lon: np.ndarray, where: str) -> None:
 def _check_way(gnss: Columns, where: str) -> None:
     """Displacements over stretches of ten seconds against the integral of the velocities.
 
-    A fault only if another reading of the columns explains the way where the given one does not.
+    A fault only if another reading of the columns explains the way where the given one does not, or if nothing does.
     """
     t, lat, lon = gnss["t"], np.radians(gnss["lat_deg"]), np.radians(gnss["lon_deg"])
     v_n, v_e = gnss["vel_n"], gnss["vel_e"]
@@ -197,6 +199,18 @@ def _check_way(gnss: Columns, where: str) -> None:
         raise InputError(
             f"{where}: positions and velocities disagree: vel_n and vel_e must count North and East, not along the "
             "car; leave them out, or give speed and course (reader.gnss.velocity.frame=course)"
+        )
+    course = np.degrees(np.arctan2(v_e[whole], v_n[whole]))[np.hypot(v_e, v_n)[whole] > MOVING]
+    if given > DISAGREES and len(course) and course.min() > -0.5 and course.max() < RADIANS_DEG:
+        raise InputError(
+            f"{where}: positions and velocities disagree: all velocities point to {course.min():.1f}° to "
+            f"{course.max():.1f}°, as of a course in radians that was read as degrees; convert the course column"
+        )
+    if given > UNRELATED:
+        raise InputError(
+            f"{where}: positions and velocities disagree: over ten seconds the velocities are off by {given:.0%} of "
+            "the way (median); check unit, order and course (degrees from North over East) of their columns, or leave "
+            "them out"
         )
 
 
@@ -263,7 +277,7 @@ def check_clocks(imu: Columns, fixes: Columns, where: str) -> None:
         raise InputError(
             f"{where}: accelerations agree with GNSS if the IMU is turned by {turned:+.0f}° about the vertical (to "
             f"the {'right' if turned > 0 else 'left'}): x must point forward; reader.imu.accel.axes and "
-            f"gyro.axes=auto, or {{roll: 0, pitch: 0, yaw: {turned:.0f}}}"
+            f"gyro.axes=auto, or of axes that are frd now {{roll: 0, pitch: 0, yaw: {turned:.0f}}}"
         )
 
 

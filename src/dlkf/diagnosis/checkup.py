@@ -22,6 +22,7 @@ GOOD, NOTE, BAD = "good", "note", "BAD"
 STYLES = {GOOD: "green", NOTE: "yellow", BAD: "bold red"}
 FASTEST_MOVE = 2.0  # m/s, from which on course is heading
 STANDING = 0.15  # m/s
+LARGE_STD = 100.0  # m, 1σ of positions: no receiver that is of use
 OFFSET_S, DELAY_S, ANGLE_DEG = 0.05, 0.3, 3.0  # more is worth a word, is a wrong clock, is a turned sensor
 
 
@@ -101,7 +102,7 @@ def gnss_findings(imu: Columns, gnss: Columns) -> Iterator[CheckupResult]:
     yield CheckupResult(GOOD if best > 0.5 else NOTE, f"GNSS: {shares}")
     gaps, most = np.diff(t), max(3 * usual, 2.0)
     if len(holes := gaps[gaps > most]):
-        yield CheckupResult(NOTE, f"GNSS: {len(holes)} gaps over {most:.3g} s, the longest {holes.max():.4g} s")
+        yield CheckupResult(NOTE, f"GNSS: gaps over {most:.3g} s: {len(holes)}, the longest {holes.max():.4g} s")
     overlap = (min(t[-1], imu["t"][-1]) - max(t[0], imu["t"][0])) / max(imu["t"][-1] - imu["t"][0], 1e-9)
     if overlap < 0.9:
         text = f"GNSS and IMU have only {max(overlap, 0):.0%} of the IMU's time in common"
@@ -114,7 +115,10 @@ def gnss_findings(imu: Columns, gnss: Columns) -> Iterator[CheckupResult]:
     text = "GNSS: no 1σ in the file; the filter takes usual ones of the quality"
     if np.isfinite(std).any():
         text = f"GNSS: horizontal 1σ {np.nanmedian(std):.2g} m in the median, {np.nanmax(std):.2g} m at worst"
-    yield CheckupResult(GOOD if np.isfinite(std).any() else NOTE, text)
+    large = np.isfinite(std).any() and np.nanmedian(std) > LARGE_STD
+    if large:
+        text += ": larger than those of usual receivers; is it in millimetres (reader.gnss.std_position.unit=mm)?"
+    yield CheckupResult(GOOD if np.isfinite(std).any() and not large else NOTE, text)
     lat, lon = gnss["lat_deg"][usable], gnss["lon_deg"][usable]
     way = horizontal_distance(lat[:-1], lon[:-1], lat[1:], lon[1:])
     v = way / np.maximum(gaps, 1e-3)
@@ -162,7 +166,7 @@ def discover_findings(tables: CheckedTables) -> Iterator[CheckupResult]:
             angle = measure_turn(finding.value)
             fine = angle < ANGLE_DEG
             text = f"pose: the sensor is turned {angle:.1f}° against the car ({finding.detail})"
-            remedy = "" if fine else "; ingest with reader=auto or reader.imu.axes"
+            remedy = "" if fine else "; ingest with reader.imu.accel.axes=auto reader.imu.gyro.axes=auto"
             yield CheckupResult(GOOD if fine else BAD, text + remedy)
 
 
