@@ -42,7 +42,7 @@ def main(settings: ConsistencySettings) -> None:
             mask = plan.masks(batch)[0]
             if not bool(mask.any()):
                 raise InputError(f"no outage fits into {matched.minutes:g} minutes; see outage.* and minutes")
-            batch, outage = withhold_fixes(batch, mask), mask[0].numpy()
+            batch, outage = withhold_fixes(batch, mask), (mask.double().mean(0) > 0.5).numpy()
         with show_progress(f"Running {name}") as progress:
             estimator = resolve_model(model, spec, tuning=settings.tuning)
             assert has_covariance(estimator)  # as ``find_states`` has seen

@@ -51,6 +51,9 @@ class FilterSettings:
     def filter_options(self) -> dict[str, Any]:
         """For :func:`dlkf.tracking.models.resolve_model`, beside the preset."""
         mean, std = self.prior.mean, self.prior.std
+        if (mean is None) != (std is None):
+            given, missing = ("std", "mean") if mean is None else ("mean", "std")
+            raise InputError(f"prior.{given} is given without prior.{missing}; give both or neither")
         prior = None if mean is None or std is None else Prior(mean, std)
         if prior is not None:
             check_prior_taken(self.models)

@@ -17,6 +17,7 @@ from dlkf.data.tables import Columns, refuse_rows
 RATES_HZ = (0.02, 1000.0)
 FAST = 3.0  # m/s: above, the ratio of two speeds means something and the car looks along its course
 LEAST_COMMON = 10  # instants at which an aid and GNSS are compared
+ENOUGH = 5000  # instants to find the lag of a clock by
 SCALES = (0.7, 1.4)  # of a wheel to GNSS that a filter may calibrate; beyond, the unit is wrong
 UNITS = {
     "km/h; divide it by 3.6 (reader.speed.value.unit=km/h)": 3.6,
@@ -99,7 +100,7 @@ def _lag(t: np.ndarray, v: np.ndarray, at: np.ndarray, ground: np.ndarray) -> fl
     inside = (at > t[0] + CLOCK_S) & (at < t[-1] - CLOCK_S)
     if inside.sum() < LEAST_COMMON or np.ptp(ground[inside]) < FAST:
         return 0.0
-    at, ground = at[inside], ground[inside]
+    at, ground = (x[inside][:: max(1, int(inside.sum()) // ENOUGH)] for x in (at, ground))
     shifted = np.abs(np.interp(at[:, None] + lags, t, v))
     scale = (shifted * ground[:, None]).sum(0) / np.maximum((shifted * shifted).sum(0), 1e-12)
     left = np.abs(scale * shifted - ground[:, None]).mean(0)  # means of magnitudes, so that slip does not decide

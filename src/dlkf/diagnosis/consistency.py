@@ -156,7 +156,8 @@ def consistency_table(results: Mapping[str, NormalisedSquares], settle_s: float,
 
 
 def draw_consistency(results: Mapping[str, NormalisedSquares], outage: NDArray[np.bool_] | None = None) -> Figure:
-    """Means over the drives through time with their bands: a column per filter, a row per type of error."""
+    """Means over the drives through time with their bands: a column per filter, a row per type of error. ``outage``:
+    the epochs without GNSS."""
     out = Figure(figsize=(1.2 + 3.2 * len(results), 7.2), layout="constrained")
     axes = out.subplots(len(KINDS), len(results), squeeze=False, sharex=True, sharey=True)
     for column, (name, result) in enumerate(results.items()):
@@ -164,9 +165,10 @@ def draw_consistency(results: Mapping[str, NormalisedSquares], outage: NDArray[n
             t = result.epoch_s * np.arange(1, values.shape[1] + 1)
             low, high = chi2_band(degrees, len(values))
             ax.axhspan(low, high, color="#009E73", alpha=0.18, lw=0)
-            if outage is not None and outage.any():
-                hidden = t[outage]
-                ax.axvspan(hidden[0] - result.epoch_s, hidden[-1], color=SHADE, alpha=0.6, lw=0, zorder=0)
+            hidden = np.flatnonzero([] if outage is None else outage)
+            for run in np.split(hidden, np.flatnonzero(np.diff(hidden) > 1) + 1):
+                if len(run):
+                    ax.axvspan(t[run[0]] - result.epoch_s, t[run[-1]], color=SHADE, alpha=0.6, lw=0, zorder=0)
             ax.axhline(1, color="#777777", lw=0.8)
             ax.semilogy(t, result.mean(values, degrees), color="#0072B2", lw=1.1)
             plain_axes(ax)

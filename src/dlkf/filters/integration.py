@@ -23,7 +23,6 @@ from dlkf.navigation.error_model import ARM_RATE_S, RATE_AVERAGE_S, antenna
 from dlkf.navigation.state import VELOCITY, NavState
 from dlkf.navigation.strapdown import Window, strapdown
 
-
 HELD_STD = 0.3  # m/s: 1σ of a speed below that at which a receiver begins to hold its fix, 0.5 m/s as a rule
 
 

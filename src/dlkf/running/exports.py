@@ -227,7 +227,12 @@ def choose_formats(export: str | list[str] | None, key: str = "export") -> list[
         raise InputError(f"{key}={export}: must be a format or a list of formats; known: {', '.join(FORMATS)}, all")
     names = [] if export is None else [export] if isinstance(export, str) else list(export)
     if names == ["all"]:
-        return [n for n in FORMATS if n not in OF_EXTRA or find_spec("rosbags") is not None]
+        if find_spec("rosbags") is not None:
+            return list(FORMATS)
+        print(
+            f"{key}=all: without {' and '.join(OF_EXTRA)}, which need the extra readers (pip install -e '.[readers]')"
+        )
+        return [n for n in FORMATS if n not in OF_EXTRA]
     if unknown := [n for n in names if n not in FORMATS]:
         raise InputError(f"{key}={unknown[0]}: unknown format; known: {', '.join(FORMATS)}, all")
     return names

@@ -96,7 +96,8 @@ class StreamingFilter:
 
     ``rate_hz``, ``epoch_s``: the grid that the filter works on, as in training and in ``navigate``.
     ``lever_arm_b`` [m]: IMU → antenna, Forward-Right-Down. ``history_s``: how late a fix may be. ``counts`` has how
-    often each status was returned (samples that are taken do not count), how many samples proved to be spikes
+    often each status was returned (samples that are taken do not count; a fix that came before the start counts again
+    when it gets its interval), how many samples proved to be spikes
     (``spikes``), how often the state was no longer finite (``diverged``), and how often the filter was lost (``lost``,
     at the times ``lost_at``). For one thread at a time.
     Raises InputError if the filter cannot run on this grid. Warns (LowSampleRateWarning) if the sample rate is too low

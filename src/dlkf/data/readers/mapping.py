@@ -120,6 +120,8 @@ class Mapped:
             row = int(np.flatnonzero(values.isna())[0])
             remedy = f"correct or remove the line, or leave such rows out with reader.{self.kind}.rows=filled"
             self.fail(row, name, f"has no value; {remedy}")
+        if not nan and len(beyond := np.flatnonzero(np.isinf(values.to_numpy(np.float64)))):
+            self.fail(int(beyond[0]), name, f"is {values.iloc[beyond[0]]}; correct or remove the line")
         return values.to_numpy()
 
     def texts(self, name: str | int) -> pd.Series:
@@ -134,7 +136,9 @@ class Mapped:
         if isinstance(names, str) or len(names) not in count:
             many = " or ".join(str(c) for c in count)
             has = "a single name" if isinstance(names, str) else f"{len(names)} names"
-            raise InputError(f"reader.{self.kind}.{key}.columns has {has}, must have {many}")
+            height = "; a log without a height needs a column with that of the place in all rows"
+            height = height if key == "position" and len(names) == 2 else ""
+            raise InputError(f"reader.{self.kind}.{key}.columns has {has}, must have {many}{height}")
         part = self.find_part(key)
         return np.stack([part.column(n, nan=nan).astype(float) for n in names], -1)
 

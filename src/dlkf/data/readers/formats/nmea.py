@@ -109,7 +109,9 @@ def fixes(messages: Iterator[Any], where: str) -> pd.DataFrame:
     if "lat_deg" not in frame:
         raise InputError(f"{where}: has no GGA or GNS sentence with a position; log GGA beside RMC")
     if frame["date"].isna().all():
-        raise InputError(f"{where}: has no date (RMC or ZDA); log RMC beside GGA or GNS")
+        raise InputError(
+            f"{where}: has no date (RMC or ZDA); log RMC beside GGA or GNS, or put a ZDA sentence of that day in front"
+        )
     frame["quality"] = frame["quality"].fillna(0)
     frame["utc_ns"] = _stamps(frame["of_day"].to_numpy(np.int64), frame["date"])
     return frame.reindex(columns=["utc_ns", *POSITION, *VELOCITY, *STD, "quality"])

@@ -24,14 +24,14 @@ NAMES = (
 
 def read(path: Path, *, kind: str, table: str | None, text: Mapping[str, Any]) -> LogTable:
     """The rows beside ``path``, the timestamps.txt; rows without a stamp or a file are left out."""
-    stamps = path.read_text().splitlines()
+    stamps = path.read_text(encoding="ascii", errors="replace").splitlines()
     files = sorted((path.parent / "data").glob("*.txt"))
     if not files:
         raise InputError(f"{path.parent}: has no data/*.txt; give the folder of a KITTI raw drive")
     rows, kept, notes = [], [], []
     for file in files:
         number = int(file.stem) if file.stem.isdigit() else -1
-        cells = file.read_text().split()
+        cells = file.read_text(encoding="ascii", errors="replace").split()
         if not 0 <= number < len(stamps) or not stamps[number].strip() or len(cells) < 25:
             notes.append(f"{file.name}: has {len(cells)} of 30 values or no stamp, left out")
             continue
