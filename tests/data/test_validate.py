@@ -87,6 +87,19 @@ def _scale(names: list[str], factor):
     return change
 
 
+def _turn_velocities(frame: pd.DataFrame) -> None:
+    """To the right, as of a course that counts from East."""
+    frame["vel_n"], frame["vel_e"] = -frame["vel_e"], frame["vel_n"].copy()
+
+
+def _course_in_radians(tables: Tables) -> Tables:
+    """Read as degrees."""
+    gnss = tables["gnss"]
+    speed, course = np.hypot(gnss.vel_n, gnss.vel_e), np.arctan2(gnss.vel_e, gnss.vel_n) % (2 * np.pi)
+    read = np.radians(course)
+    return {**tables, "gnss": gnss.assign(vel_n=speed * np.cos(read), vel_e=speed * np.sin(read))}
+
+
 def _nowhere(frame: pd.DataFrame) -> pd.DataFrame:
     """Three fixes before the receiver has a position."""
     return frame.assign(**{c: frame[c].where(frame.index >= 3, 0.0) for c in ("lat_deg", "lon_deg")})
@@ -174,6 +187,8 @@ BAD = {
     "latitude out of range": (_columns("gnss", _scale(["lat_deg"], 2)), "lat_deg is 97.*swapped"),
     "radians": (_columns("gnss", _scale(["lat_deg", "lon_deg"], np.pi / 180)), "look like radians"),
     "swapped velocity": (_columns("gnss", _swap("vel_n", "vel_e")), "vel_n and vel_e look swapped"),
+    "a course in radians": (_course_in_radians, "as of a course in radians"),
+    "velocities across the way": (_columns("gnss", _turn_velocities), "off by .* of the way"),
     "km/h": (_columns("gnss", _scale(["vel_n", "vel_e", "vel_d"], 3.6)), "km/h"),
     "velocities divided by 3.6": (_columns("gnss", _scale(["vel_n", "vel_e", "vel_d"], 1 / 3.6)), "divided by 3.6"),
     "no position yet": (_rows("gnss", _nowhere), "fix 0 is at 0°/0°, as 3 of .*reader.gnss.position.zero=none"),

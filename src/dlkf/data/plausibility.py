@@ -146,10 +146,15 @@ def _check_places(lat: np.ndarray, lon: np.ndarray, where: str) -> None:
         )
 
 
-def _check_way(gnss: Columns, where: str) -> None:
+def check_velocities(gnss: Columns, where: str) -> None:
+    """InputError where the velocities of good fixes explain nothing of the way, in whatever unit or order."""
+    _check_way(gnss, where, unexplained=True)
+
+
+def _check_way(gnss: Columns, where: str, *, unexplained: bool = False) -> None:
     """Displacements over stretches of ten seconds against the integral of the velocities.
 
-    A fault only if another reading of the columns explains the way where the given one does not, or if nothing does.
+    A fault only if another reading of the columns explains the way where the given one does not, or ``unexplained`` if none does.
     """
     t, lat, lon = gnss["t"], np.radians(gnss["lat_deg"]), np.radians(gnss["lon_deg"])
     v_n, v_e = gnss["vel_n"], gnss["vel_e"]
@@ -206,7 +211,7 @@ def _check_way(gnss: Columns, where: str) -> None:
             f"{where}: positions and velocities disagree: all velocities point to {course.min():.1f}° to "
             f"{course.max():.1f}°, as of a course in radians that was read as degrees; convert the course column"
         )
-    if given > UNRELATED:
+    if unexplained and given > UNRELATED:
         raise InputError(
             f"{where}: positions and velocities disagree: over ten seconds the velocities are off by {given:.0%} of "
             "the way (median); check unit, order and course (degrees from North over East) of their columns, or leave "
