@@ -217,6 +217,7 @@ def test_mistakes_in_the_files(tmp_path, tables):
     for line, cells, message in (
         (41, "0.4,0,0,oops,0,0,-9.8", "line 42: column 'gyro_z' is 'oops', not a number"),
         (41, "0.4,0,0,,0,0,-9.8", "line 42: column 'gyro_z' has no value"),
+        (41, "0.4,0,0,inf,0,0,-9.8", "line 42: column 'gyro_z' is inf; correct or remove the line"),
         (41, "0.4,0,0,0,0,0,-9.8,7,7", "line 42 has 9 cells, those before have 7; correct the line"),
         (41, "0.39,0,0,0,0,0,-9.8", r"line 42 \(t 0.39\): t goes back"),
     ):

@@ -14,7 +14,13 @@ import yaml
 from dlkf.base.config import config_dir
 from dlkf.data.masks import withhold_fixes
 from dlkf.data.segments import StartLaw
-from dlkf.diagnosis.consistency import chi2_band, measure_consistency, normalised_square
+from dlkf.diagnosis.consistency import (
+    NormalisedSquares,
+    chi2_band,
+    draw_consistency,
+    measure_consistency,
+    normalised_square,
+)
 from dlkf.diagnosis.matched_drives import MatchedDrives, make_matched_batch, make_matched_drives
 from dlkf.evaluation.outages import OutagePlan
 from dlkf.filters.build import build_filter
@@ -89,3 +95,12 @@ def test_the_command_writes_table_picture_and_numbers(call):
     assert done.code == 2 and "model ins has no covariance" in done.err and not Path("nowhere").exists()
     done = call("consistency", "model=mbkf15", "out=nowhere", "drives=1")
     assert done.code == 2 and "drives is 1" in done.err
+
+
+def test_outages_are_drawn_apart():
+    """The first epoch, three and the last one: each from the end of the epoch before."""
+    ones = np.ones((2, 12))
+    hidden = np.isin(np.arange(12), (0, 4, 5, 6, 11))
+    for ax in draw_consistency({"mbkf15": NormalisedSquares(15, 2.0, ones, ones, ones)}, hidden).axes:
+        shaded = sorted((p.get_x(), p.get_x() + p.get_width()) for p in ax.patches if p.get_width() < 24)
+        assert [span for span in shaded if span[1] > 1] == [(0.0, 2.0), (8.0, 14.0), (22.0, 24.0)]

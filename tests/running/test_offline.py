@@ -104,6 +104,10 @@ def test_the_summary_says_how_long_a_restart_took():
     t = result.table.t
     gone = replace(result, table=result.table[(t < 300) | (t > 400)], restarts=(100.0, 300.0, float(t.iloc[-1])))
     assert "started over at t = 100, 300 (no solution until 401), 1199 (no solution after it) s" in gone.summary()
+    often = replace(result, restarts=tuple(10.0 * k for k in range(1, 9)))
+    assert "started over at t = 10, 20, 30, 40, 50 s and 3 times more" in often.summary()
+    page = summary_lines("plus", [TrackOnMap(x, driven(0).fixes) for x in (often, gone, result)])
+    assert any("started over 8 times in" in line and "3 times in" in line for line in page)
 
 
 def test_the_summary_says_where_the_car_goes_in_the_axes_of_its_imu():
