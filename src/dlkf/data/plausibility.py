@@ -154,7 +154,8 @@ def check_velocities(gnss: Columns, where: str) -> None:
 def _check_way(gnss: Columns, where: str, *, unexplained: bool = False) -> None:
     """Displacements over stretches of ten seconds against the integral of the velocities.
 
-    A fault only if another reading of the columns explains the way where the given one does not, or ``unexplained`` if none does.
+    A fault only if another reading of the columns explains the way where the given one does not, or ``unexplained``
+    if none does.
     """
     t, lat, lon = gnss["t"], np.radians(gnss["lat_deg"]), np.radians(gnss["lon_deg"])
     v_n, v_e = gnss["vel_n"], gnss["vel_e"]
