@@ -22,6 +22,10 @@ GOOD, NOTE, BAD = "good", "note", "BAD"
 STYLES = {GOOD: "green", NOTE: "yellow", BAD: "bold red"}
 FASTEST_MOVE = 2.0  # m/s, from which on course is heading
 STANDING = 0.15  # m/s
+SUBJECTS = {  # of settings that are estimated
+    "imu.axes": "pose of the sensor", "imu.time.offset_s": "offset of the clocks", "lever_arm_m": "lever arm",
+    "gnss.time.drift_ppm": "drift of the clocks",
+}  # fmt: skip
 LARGE_STD = 100.0  # m, 1σ of positions: no receiver that is of use
 OFFSET_S, DELAY_S, ANGLE_DEG = 0.05, 0.3, 3.0  # more is worth a word, is a wrong clock, is a turned sensor
 
@@ -155,7 +159,8 @@ def discover_findings(tables: CheckedTables) -> Iterator[CheckupResult]:
         ):
             continue
         if not finding.sure:
-            text = f"{finding.setting}: the motion does not determine it well enough ({finding.detail})"
+            what = SUBJECTS.get(finding.setting, finding.setting)
+            text = f"{what}: the motion does not determine it well enough ({finding.detail})"
             yield CheckupResult(NOTE, text)
         elif finding.setting == "gnss.time.drift_ppm":
             text = f"clocks: {finding.value:+.0f} {finding.detail}; {ESTIMATED}{autos}"
