@@ -73,8 +73,8 @@ def check_imu_units(imu: Columns, where: str) -> None:
     if axes[2] > UPRIGHT * size:
         raise InputError(
             f"{where}: accel_z is {axes[2]:+.2f} m/s² in the median, must be about −9.8 (Forward-Right-"
-            "Down): the z axis points up; reader.imu.accel.axes and gyro.axes=auto (flu of a log as recorded, frd of "
-            "one that was read as flu), or negate y and z of accel and gyro"
+            "Down); the z axis points up (FLU?): reader.imu.accel.axes=auto and gyro.axes=auto, or negate y and z of "
+            "accel and gyro"
         )
     if axes[2] > -UPRIGHT * size:
         k = int(np.abs(axes).argmax())
