@@ -8,6 +8,7 @@ import torch
 from dlkf.filters.integration import integrate
 from dlkf.filters.shipped import trained_filter
 from dlkf.filters.slow_errors import NAMES, ErrorChange, add_columns
+from dlkf.filters.smoother import smooth
 from dlkf.navigation.state import POSITION, ErrorStates
 
 from .test_constraints import slipping
@@ -73,6 +74,17 @@ def test_a_position_does_not_follow_the_receivers_slow_errors():
     off, receiver = (x[:, late, :2] for x in (solution.posterior.p_n - batch.truth.p_n, errors))
     assert off.square().mean() < 0.6**2 * receiver.square().mean()
     assert 0.2 < (off / solution.std[:, late, :2]).square().mean() < 1.5
+
+
+def test_a_smoothed_position_is_closer_and_as_sure_as_it_is():
+    """The decay of the states is in Φ: in the middle of ten minutes less than 0.8 of the filter's error."""
+    batch, _ = wandering(600)
+    with torch.inference_mode():
+        filtered, smoothed = solve(batch), smooth(batch, trained_filter("plus"))
+    middle = slice(200, 400)
+    before, after = ((x.posterior.p_n - batch.truth.p_n)[:, middle, :2] for x in (filtered, smoothed))
+    assert after.square().mean() < 0.8**2 * before.square().mean()
+    assert 0.2 < (after / smoothed.std[:, middle, :2]).square().mean() < 2.0
 
 
 def test_the_first_fixes_after_an_outage_are_given_up_again():

@@ -74,8 +74,7 @@ class ConstraintNoise(NamedTuple):
         keep = 1 - counts / MEMORY
         most = sigmas**2 * (of_state + self.factor * variance)
         square = torch.minimum(z.square(), most) / (of_state + variance)
-        most = bias_steps.LARGEST
-        e = (z / (of_state + variance).sqrt()).clamp(-most, most)
+        e = (z / (of_state + variance).sqrt()).clamp(-bias_steps.LARGEST, bias_steps.LARGEST)
         left = 1 - counts / bias_steps.MEMORY
         return ConstraintNoise(
             keep * self.squares + counts * square, keep * self.fixes + counts,
