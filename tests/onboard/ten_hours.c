@@ -51,7 +51,8 @@ int main(void) {
   dlkf_open(&filter, arm);
   for (long k = 1; k <= HOURS * 3600L * IMU_HZ; k++) {
     if (k == 120L * IMU_HZ) counted = allocations, getrusage(RUSAGE_SELF, &early);
-    double t = (double)k / IMU_HZ, accel[3] = {0, SPEED * RATE, -9.81}, gyro[3] = {0, 0, RATE};
+    const double noise = 1e-4 * ((int)drawn(201) - 100); /* the same numbers again would be those of a frozen IMU */
+    double t = (double)k / IMU_HZ, accel[3] = {noise, SPEED * RATE, -9.81}, gyro[3] = {0, 0, RATE};
     if (k % IMU_HZ == 0) {
       double stamp = t, v[3];
       fix_at(t, fix);
