@@ -8,10 +8,10 @@ import pytest
 import torch
 
 from dlkf.base.errors import InputError
-from dlkf.filters.advice import NetworkOutput
 from dlkf.filters.build import FilterName, build_filter, is_filter, refuse_smoothed
 from dlkf.filters.gating import Gate
 from dlkf.filters.integration import integrate
+from dlkf.filters.noise_factors import NoiseFactors
 from dlkf.filters.smoother import SmoothedSolution
 from dlkf.running.likelihood import check_finds_noise
 from tests.docs.pages import ROOT, blocks
@@ -101,8 +101,8 @@ class Advised:
         return self.kalman.begin(batch)
 
     def step(self, memory, epoch):
-        advice = NetworkOutput(fix=self.factors.expand(len(epoch.z), 4))
-        return self.kalman.step(memory, epoch._replace(advice=advice))
+        noise = NoiseFactors(fix=self.factors.expand(len(epoch.z), 4))
+        return self.kalman.step(memory, epoch._replace(noise=noise))
 
 
 def test_advice_on_a_fix_is_a_factor_on_its_std():

@@ -37,7 +37,7 @@ from dlkf.filters.vibration_spectrum import (
     shifts,
     tone_shares,
 )
-from dlkf.filters.vibration_speed import FEW, MEMORY, Mean, Stretch, VibrationMemory, VibrationSpeed, _predictive
+from dlkf.filters.vibration_speed import FEW, MEMORY, Block, Mean, VibrationMemory, VibrationSpeed, _predictive
 from dlkf.navigation.calibration import ImuError
 from dlkf.navigation.state import NavState
 from tests.cars import car
@@ -251,7 +251,7 @@ def test_a_wrong_heading_is_no_wrong_speed():
     batch = cars(1, 4, noise)
     made_ = source()
     for lag in (0.0, 0.3):
-        block = Stretch.begin(batch.imu, 1)
+        block = Block.begin(batch.imu, 1)
         block = block._replace(distance=block.distance + 36.0, elapsed=block.elapsed + 3.0, turned=block.turned + lag)
         v, C_nb = torch.tensor([[7.0, 9.0, 0.0]]).double(), batch.start.C_nb
         v = 12.0 * v / v.norm()

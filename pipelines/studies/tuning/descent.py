@@ -12,9 +12,9 @@ import torch
 from torch import Tensor, nn
 
 from dlkf.data.drive import Batch
-from dlkf.filters.advice import NetworkOutput
 from dlkf.filters.integration import Correction, Epoch, integrate
 from dlkf.filters.model_based import Mbkf
+from dlkf.filters.noise_factors import NoiseFactors
 from dlkf.filters.tuning import Tuning
 from dlkf.navigation.calibration import ImuError
 
@@ -42,8 +42,8 @@ class ScaledFilter(nn.Module):
         """Of the Kalman filter with the factors in force."""
         of = self.logarithms.exp().expand(len(epoch.z), -1)
         fix = of[:, [4, 4, 5, 5]]
-        advice = NetworkOutput(of[:, :4, None].expand(-1, 4, 3), fix, of[:, 6:8])
-        return self.kalman.step(memory, epoch._replace(advice=advice))
+        noise = NoiseFactors(of[:, :4, None].expand(-1, 4, 3), fix, of[:, 6:8])
+        return self.kalman.step(memory, epoch._replace(noise=noise))
 
     def tuning(self) -> Tuning:
         """Settings with which a filter without advice is the same."""

@@ -88,8 +88,8 @@ class CarConstraints:
         used = torch.cat(((moving.unsqueeze(-1) & ~resting).expand(-1, 2), resting.expand(-1, 3), shown), -1)
         per_second = max(1.0, 1.0 / epoch.span_s)
         variance = (memory.std.square() * per_second).expand(len(zn), -1)
-        if epoch.advice is not None and epoch.advice.across is not None:
-            variance = torch.cat((variance[:, :2] * epoch.advice.across.square(), variance[:, 2:]), -1)
+        if epoch.noise is not None and epoch.noise.across is not None:
+            variance = torch.cat((variance[:, :2] * epoch.noise.across.square(), variance[:, 2:]), -1)
         noise, of_state, a_second = memory.noise, predicted_variance(prediction.P, Hn), variance[:, :2] / per_second
         if noise is not None:
             variance = torch.cat((noise.factor * variance[:, :2], variance[:, 2:]), -1)

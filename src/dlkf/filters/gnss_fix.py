@@ -62,7 +62,7 @@ class GnssFix:
         R = torch.maximum(scale * epoch.fix.std, floor).square()
         if noise is not None:
             R = torch.where(noise.settled.unsqueeze(-1), noise.R, R)
-        factors = None if epoch.advice is None else epoch.advice.fix_std
+        factors = None if epoch.noise is None else epoch.noise.fix_std
         return R if factors is None else R * factors.square()
 
     def matrix(self, epoch: Epoch) -> Float[Tensor, "B 6 n"]:

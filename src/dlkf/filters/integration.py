@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from dlkf.data.drive import Batch
-from dlkf.filters.advice import NetworkOutput
+from dlkf.filters.noise_factors import NoiseFactors
 from dlkf.navigation.calibration import ImuError
 from dlkf.navigation.earth import TangentFrame
 from dlkf.navigation.error_model import ARM_RATE_S, RATE_AVERAGE_S, antenna
@@ -60,7 +60,7 @@ class Epoch(NamedTuple):
     lever_arm_b: Tensor | None  # (B, 3); None: the antenna is at the IMU
     dt: float
     frame: TangentFrame
-    advice: NetworkOutput | None = None  # of a network round the filter
+    noise: NoiseFactors | None = None  # from outside the filter
 
     @property
     def imu_error(self) -> Tensor:

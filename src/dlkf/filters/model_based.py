@@ -235,7 +235,7 @@ class Mbkf:
         Phi = self._transition(memory, epoch)
         if has_g_sensitivity(self.states):
             Phi = add_columns(Phi, epoch.corrected, self.states)
-        process = None if epoch.advice is None else epoch.advice.process
+        process = None if epoch.noise is None else epoch.noise.process
         Q = memory.windows.noise(Phi, None if process is None else source_scale(process, epoch.start.C_nb))
         if memory.noise is not None:
             Q = torch.where(memory.noise.settled[:, None, None], memory.noise.Q, Q)
@@ -266,8 +266,8 @@ class Mbkf:
         tails = memory.tails
         if tails is not None:
             tails, P, dx = tails.update(P, dx, epoch.error, self.states, epoch.used.any(-1))
-        if memory.parameters is not None and epoch.advice is not None and epoch.advice.kept is not None:
-            P, dx = discount_information(P, dx, memory.parameters, self.states, epoch.advice.kept)
+        if memory.parameters is not None and epoch.noise is not None and epoch.noise.kept is not None:
+            P, dx = discount_information(P, dx, memory.parameters, self.states, epoch.noise.kept)
         noise = memory.noise
         if noise is not None:
             R = self.fix.variance(epoch, memory.fix, noise)

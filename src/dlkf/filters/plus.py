@@ -26,7 +26,6 @@ from torch import Tensor, nn
 from dlkf.base.errors import InputError
 from dlkf.base.settings import settings_from
 from dlkf.data.drive import Batch
-from dlkf.filters.advice import NetworkOutput
 from dlkf.filters.aids.attach import add_sources
 from dlkf.filters.bias_steps import BiasSteps
 from dlkf.filters.branches import may_branch
@@ -44,8 +43,9 @@ from dlkf.filters.matching import (
 )
 from dlkf.filters.model_based import KalmanMemory as KalmanMemory
 from dlkf.filters.model_based import Mbkf
+from dlkf.filters.noise_factors import NoiseFactors
 from dlkf.filters.position_errors import PositionErrors
-from dlkf.filters.slow_errors import NAMES, SlowErrors
+from dlkf.filters.slow_errors import NAMES, ErrorChange, SlowErrors
 from dlkf.filters.tuning import Tuning
 from dlkf.filters.virtual_outages import VirtualOutage
 from dlkf.navigation.calibration import ImuError
@@ -185,30 +185,65 @@ class PlusFilter(nn.Module):
         return PlusMemory(kalman, network, zero, zero, matching, zero, outage, errors, fix_noise, steps), error
 
     def step(self, memory: PlusMemory, epoch: Epoch) -> tuple[PlusMemory, Correction]:
-        """Network, the Kalman filter with the noise of both, then the virtual outage beside it."""
-        span = epoch.span_s
-        slow, first = self.states.of(NAMES[0]).start, self.states.of_others.start
-        errors, change = memory.errors.advance(epoch, memory.since_fix)
-        kalman, outage = memory.kalman, memory.outage
+        """One update interval: the fix is screened, the noise adapted, the Kalman filter run, and the fix teaches."""
+        interval = memory.since_fix + epoch.span_s
+        memory, change = self._propagate_slow_errors(memory, epoch)
+        kalman, claimed = self.kalman.predict_fix(memory.kalman, epoch)
+        kalman = self._let_mounting_turn(kalman, claimed)
+        offered = memory.fix_noise.inflate_fix(claimed)
+        kalman, epoch = self.kalman.screen_fix(kalman, offered)
+        memory, of_network, noise = self._adapt_noise(memory._replace(kalman=kalman), epoch, offered)
+        kalman, correction = self.kalman.update(memory.kalman, epoch._replace(noise=noise))
+        rejected = self.kalman.find_rejected(memory.kalman, offered._replace(noise=noise), epoch, correction)
+        with torch.no_grad():
+            if (c := correction.covariances) is not None:
+                slow = self._slow.start
+                correction = correction._replace(covariances=c._replace(Phi=change.add_decay(c.Phi, slow)))
+            memory = self._learn(memory, epoch, claimed, offered, correction, of_network, interval)
+        if correction.std is not None:
+            correction = correction._replace(std=memory.errors.add_slow_std(correction.std))
+        return memory._replace(kalman=kalman), correction._replace(innovation=claimed.z, rejected=rejected)
+
+    @property
+    def _slow(self) -> slice:
+        """The states of slow position errors."""
+        start = self.states.of(NAMES[0]).start
+        return slice(start, start + len(NAMES))
+
+    def _slow_estimates(self, kalman: KalmanMemory) -> Float[Tensor, "B 3"]:
         assert kalman.parameters is not None
-        parameters = change.shrink(kalman.parameters, slow - first)
+        first = self._slow.start - self.states.of_others.start
+        return kalman.parameters[:, first:][:, : len(NAMES)]
+
+    def _propagate_slow_errors(self, memory: PlusMemory, epoch: Epoch) -> tuple[PlusMemory, ErrorChange]:
+        """Slow errors of positions over the update interval, in the filter and in the virtual outage beside it."""
+        errors, change = memory.errors.advance(epoch, memory.since_fix)
+        kalman, outage, slow = memory.kalman, memory.outage, self._slow.start
+        assert kalman.parameters is not None
+        parameters = change.shrink(kalman.parameters, slow - self.states.of_others.start)
         kalman = kalman._replace(P=change.propagate(kalman.P, slow), parameters=parameters)
         outage = outage._replace(
             P=change.propagate(outage.P, slow, follows=False), drift=change.shrink(outage.drift, slow)
         )
-        kalman, claimed = self.kalman.predict_fix(kalman, epoch)
+        return memory._replace(kalman=kalman, outage=outage, errors=errors), change
+
+    def _let_mounting_turn(self, kalman: KalmanMemory, claimed: Epoch) -> KalmanMemory:
+        """The Kalman filter with more uncertainty of the mounting, where the constraints show that it turns."""
         for source, of_source in zip(self.kalman.sources, kalman.sources, strict=True):
             if isinstance(source, CarConstraints):
                 kalman = kalman._replace(P=source.let_mounting_turn(kalman.P, of_source, claimed))
-        offered = memory.fix_noise.inflate_fix(claimed)
-        kalman, epoch = self.kalman.screen_fix(kalman, offered)
-        memory = memory._replace(kalman=kalman, outage=outage, errors=errors)
-        fixed, interval = epoch.used.any(-1), memory.since_fix + span
+        return kalman
+
+    def _adapt_noise(
+        self, memory: PlusMemory, epoch: Epoch, offered: Epoch
+    ) -> tuple[PlusMemory, Float[Tensor, "B 4 3"], NoiseFactors]:
+        """Memory with this fix's innovations, factors of the network alone, and those in force: network and levels."""
+        fixed = epoch.used.any(-1)
         with torch.no_grad():
             normalised = self._normalise_innovation(memory, epoch)
             memory = memory._replace(
-                elapsed=memory.elapsed + span,
-                since_fix=torch.where(fixed, 0.0, interval),
+                elapsed=memory.elapsed + epoch.span_s,
+                since_fix=torch.where(fixed, 0.0, memory.since_fix + epoch.span_s),
                 matching=memory.matching.update(normalised, epoch.used),
             )
             bands = window_features(epoch.corrected, epoch.dt)
@@ -227,33 +262,30 @@ class PlusFilter(nn.Module):
             torch.cat((torch.stack((same, x), 1), walks), 1) for x in (gyro_noise, gyro_noise ** weight.unsqueeze(-1))
         )
         process = in_force * torch.cat((levels, levels.clamp_min(1.0)), -1).unsqueeze(-1)
-        of_fix = memory.errors.noise(offered, kalman.fix.scale[0, 0, 0])
-        advice = NetworkOutput(process, of_fix, kept=memory.fix_noise.kept)
-        kalman, correction = self.kalman.update(memory.kalman, epoch._replace(advice=advice))
-        rejected = self.kalman.find_rejected(memory.kalman, offered._replace(advice=advice), epoch, correction)
-        with torch.no_grad():
-            after = epoch.window.end.correct(correction.dx)
-            forward = (after.C_nb[:, :, 0] * after.v_n).sum(-1)
-            matching, outage, errors = memory.matching, memory.outage, memory.errors
-            fix_noise, steps = memory.fix_noise, memory.steps
-            if (c := correction.covariances) is not None:
-                scale = source_scale(of_network, epoch.start.C_nb)
-                c = c._replace(Phi=change.add_decay(c.Phi, slow))
-                correction = correction._replace(covariances=c)
-                outage = outage.update(epoch, c, memory.kalman.windows, scale)
-                offering = c._replace(H=self.kalman.fix.matrix(claimed))  # before the gate
-                estimated, corrected = parameters[:, slow - first :][:, :3], c.dx[:, slow : slow + 3]
-                errors = errors.update(offered, offering, estimated, corrected)
-                fix_noise = fix_noise.update(claimed, offering, outage)
-                matching = matching.update_ratios(c.dx, c.predicted, c.updated, epoch.window.end.C_nb, fixed)
-                steps = steps.update(c, interval, fixed)
-        if correction.std is not None:
-            correction = correction._replace(std=errors.add_slow_std(correction.std))
-        correction = correction._replace(innovation=claimed.z, rejected=rejected)
+        of_fix = memory.errors.noise(offered, memory.kalman.fix.scale[0, 0, 0])
+        return memory._replace(hidden=hidden), of_network, NoiseFactors(process, of_fix, kept=memory.fix_noise.kept)
+
+    def _learn(
+        self, memory: PlusMemory, epoch: Epoch, claimed: Epoch, offered: Epoch, correction: Correction,
+        of_network: Float[Tensor, "B 4 3"], interval: Float[Tensor, " B"],
+    ) -> PlusMemory:  # fmt: skip
+        """Memory, but for the Kalman filter's, with what the fix and the corrections of this update show."""
+        fixed, end = epoch.used.any(-1), epoch.window.end
+        after = end.correct(correction.dx)
+        forward = (after.C_nb[:, :, 0] * after.v_n).sum(-1)
+        memory = memory._replace(fix_speed=torch.where(fixed, forward, memory.fix_speed))
+        if (c := correction.covariances) is None:
+            return memory
+        scale = source_scale(of_network, epoch.start.C_nb)
+        outage = memory.outage.update(epoch, c, memory.kalman.windows, scale)
+        offering = c._replace(H=self.kalman.fix.matrix(claimed))  # before the gate
+        estimated = self._slow_estimates(memory.kalman)
         return memory._replace(
-            kalman=kalman, hidden=hidden, matching=matching, outage=outage, errors=errors, fix_noise=fix_noise,
-            fix_speed=torch.where(fixed, forward, memory.fix_speed), steps=steps,
-        ), correction  # fmt: skip
+            outage=outage, errors=memory.errors.update(offered, offering, estimated, c.dx[:, self._slow]),
+            fix_noise=memory.fix_noise.update(claimed, offering, outage),
+            matching=memory.matching.update_ratios(c.dx, c.predicted, c.updated, end.C_nb, fixed),
+            steps=memory.steps.update(c, interval, fixed),
+        )  # fmt: skip
 
     def _normalise_innovation(self, memory: PlusMemory, epoch: Epoch) -> Float[Tensor, "B 6"]:
         """Innovations over their 1σ as the filter of the last epoch has it, in heading axes; zero without a fix."""

@@ -73,7 +73,7 @@ TOGETHER = 10.0  # measurements that share the error of the mean
 UNCHECKED_S = 100.0  # s after a fix over which R grows
 
 
-class Stretch(NamedTuple):
+class Block(NamedTuple):
     """Samples of some update intervals."""
 
     spectrum: Tensor  # (B, 6, waves)
@@ -85,7 +85,7 @@ class Stretch(NamedTuple):
     turned_s: Tensor  # (B,) its integral over time
 
     @classmethod
-    def begin(cls, like: Tensor, B: int) -> Stretch:
+    def begin(cls, like: Tensor, B: int) -> Block:
         """Nothing in it."""
         zero = like.new_zeros(B)
         return cls(like.new_zeros(B, 6, WAVES), zero, zero, zero + 1e3, zero > 0, zero, zero)
@@ -100,7 +100,7 @@ class Stretch(NamedTuple):
         """By what the course at the end is ahead of the mean course [rad]."""
         return self.turned - self.turned_s / self.elapsed.clamp_min(1e-3)
 
-    def update(self, epoch: Epoch, block_s: float, last: Float[Tensor, "B 6"]) -> Stretch:
+    def update(self, epoch: Epoch, block_s: float, last: Float[Tensor, "B 6"]) -> Block:
         """With one more update interval; ``last`` is the sample before it."""
         x, dt = epoch.corrected, epoch.dt
         M = x.shape[1]
@@ -113,7 +113,7 @@ class Stretch(NamedTuple):
         known = (last != 0).any(-1, keepdim=True)
         turn = dt * x[..., 5].sum(1)
         before = torch.cat((torch.where(known, last, x[:, 0]).unsqueeze(1), x[:, :-1]), 1)
-        return Stretch(
+        return Block(
             demodulate((x - before) * window.unsqueeze(-1), distance, self.spectrum),
             self.distance + step.sum(1), self.elapsed + dt * M,
             torch.minimum(self.slowest, -(-speed).amax(1)), self.fixed | epoch.used.any(-1),
@@ -148,7 +148,7 @@ class Mean(NamedTuple):
 class VibrationMemory(NamedTuple):
     """Memory of the source; nothing of it has axes in n."""
 
-    block: Stretch
+    block: Block
     last_sample: Tensor  # (B, 6)
     by_distance: Mean
     by_time: Mean
@@ -174,7 +174,7 @@ class VibrationSpeed(SensorSource):
         like, B = batch.imu, batch.size[0]
         evidence = like.new_tensor([DOUBT, *(0.0 for _ in SHARES[1:])]).expand(B, -1).clone()
         return VibrationMemory(
-            Stretch.begin(like, B), like.new_zeros(B, 6), Mean.begin(like, B, LINES), Mean.begin(like, B, TONES),
+            Block.begin(like, B), like.new_zeros(B, 6), Mean.begin(like, B, LINES), Mean.begin(like, B, TONES),
             like.new_zeros(B), evidence, like.new_zeros(B),
         )  # fmt: skip
 
@@ -198,7 +198,7 @@ class VibrationSpeed(SensorSource):
             zeros(B, 1), zeros(B, 1, self.states.count), zeros(B, 1), zeros(B, 1, dtype=torch.bool)
         )  # fmt: skip
         return select_branch(done, row, nothing), memory._replace(
-            block=_reset_stretch(block, done), by_distance=select_branch(done, by_distance, memory.by_distance),
+            block=_reset_block(block, done), by_distance=select_branch(done, by_distance, memory.by_distance),
             by_time=select_branch(done, by_time, memory.by_time), blocks=select_branch(done, blocks, memory.blocks),
             evidence=select_branch(done, evidence, memory.evidence),
         )  # fmt: skip
@@ -260,7 +260,7 @@ class VibrationSpeed(SensorSource):
         R = torch.where(measured, R, 0.0)
         return Measurement(z.unsqueeze(-1), H, R.unsqueeze(-1), used.unsqueeze(-1))
 
-    def _matrix(self, epoch: Epoch, block: Stretch) -> Float[Tensor, "B 1 n"]:
+    def _matrix(self, epoch: Epoch, block: Block) -> Float[Tensor, "B 1 n"]:
         """H of ln of the true over the filter's mean speed of a block that ends now.
 
         At its middle, L ago, the velocity had the direction u, and its error was that of now before the errors of
@@ -303,10 +303,10 @@ def _log_sum(log: Float[Tensor, "B m n"]) -> Float[Tensor, "B m"]:
     return (torch.log(torch.exp(log - most).sum(-1, keepdim=True)) + most).squeeze(-1)
 
 
-def _reset_stretch(stretch: Stretch, over: Bool[Tensor, " B"]) -> Stretch:
-    """The stretch, or where it is over a new one."""
-    return Stretch(
-        torch.where(over[:, None, None], 0.0, stretch.spectrum), torch.where(over, 0.0, stretch.distance),
-        torch.where(over, 0.0, stretch.elapsed), torch.where(over, 1e3, stretch.slowest), stretch.fixed & ~over,
-        torch.where(over, 0.0, stretch.turned), torch.where(over, 0.0, stretch.turned_s),
+def _reset_block(block: Block, over: Bool[Tensor, " B"]) -> Block:
+    """The block, or where it is over a new one."""
+    return Block(
+        torch.where(over[:, None, None], 0.0, block.spectrum), torch.where(over, 0.0, block.distance),
+        torch.where(over, 0.0, block.elapsed), torch.where(over, 1e3, block.slowest), block.fixed & ~over,
+        torch.where(over, 0.0, block.turned), torch.where(over, 0.0, block.turned_s),
     )  # fmt: skip

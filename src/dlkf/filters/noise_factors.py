@@ -10,7 +10,7 @@ from typing import NamedTuple
 from torch import Tensor
 
 
-class NetworkOutput(NamedTuple):
+class NoiseFactors(NamedTuple):
     """Of one epoch; None: as the filter itself has it."""
 
     process: Tensor | None = None  # (B, 4, 3) accelerometer and gyroscope noise, their walks; forward, right, down
