@@ -335,6 +335,10 @@ def test_the_level_is_that_of_a_second_whatever_the_update_interval():
     for rate in (10, 26, 64, 125, 128, 208, 416):  # a second has all that it needs
         whole = replace(batch, imu=torch.zeros(2, 3, rate, 6, dtype=D), dt=1 / rate)
         assert LastSecond.begin(whole).means is None
+    for rate in range(10, 60):  # nor does it matter whether means of 0.1 s divide it
+        x = batch.imu[:, :, :1].expand(-1, -1, rate, -1) + torch.arange(rate, dtype=D)[:, None] / rate
+        level = LastSecond.begin(replace(batch, imu=x, dt=1 / rate)).update(x[:, 0], 1 / rate)[1].level
+        torch.testing.assert_close(level, torch.full((2,), 3 / 12, dtype=D), rtol=0.4, atol=0.0)
     slow = replace(batch, imu=batch.imu.mean(2, keepdim=True), dt=1.0)
     assert LastSecond.begin(slow).update(slow.imu[:, 0], 1.0)[1].level is None
 

@@ -98,7 +98,8 @@ class LastSecond(NamedTuple):
         if parts.samples > 1:
             means = means.unflatten(1, (parts.each, parts.samples)).mean(2)
         if self.means is not None:
-            means = torch.cat((self.means, means), 1)[:, -parts.count :]
+            means = torch.cat((self.means, means), 1)
+        means = means[:, -parts.count :]
         boxes = means.unflatten(1, (-1, parts.together)).mean(2) if parts.together > 1 else means
         level, variance = None, torch.zeros_like(boxes[:, 0, 3:])
         if boxes.shape[1] > 1:
