@@ -246,8 +246,9 @@ class VibrationSpeed(SensorSource):
     ) -> Measurement:  # fmt: skip
         """What a block measures: of a likelihood under a Gaussian, innovation and variance that make its moments."""
         off, share = shifts(likelihood), memory.share
-        searched = of_speed + SEARCH**2
-        p = _probability(share.unsqueeze(-1) * likelihood - 0.5 * off.square() / searched.unsqueeze(-1))
+        prior = -0.5 * off.square() / (of_speed + SEARCH**2).unsqueeze(-1)
+        searched = (_probability(prior) * off.square()).sum(-1)  # less than all of it, where the shifts end before
+        p = _probability(share.unsqueeze(-1) * likelihood + prior)
         mean = (p * off).sum(-1)
         variance = (p * (off - mean.unsqueeze(-1)).square()).sum(-1) + FINEST**2
         says = variance < SAYS * searched
