@@ -9,7 +9,7 @@ import pytest
 import torch
 from pipelines.studies.ablations.plus_parts import parts
 
-from dlkf.filters.bias_steps import LARGEST, LIMIT, MEMORY, POWER, BiasSteps
+from dlkf.filters.bias_steps import LARGEST, LIMIT, MEMORY, POWER, SPACING_S, SignTest, normalise_corrections
 from dlkf.filters.integration import Covariances, integrate
 from dlkf.filters.shipped import trained_filter
 from dlkf.navigation.state import IMU
@@ -19,15 +19,16 @@ from .test_constraints import slipping
 D = torch.float64
 
 
-def corrected(e: torch.Tensor, dt: float = 1.0, lost: float = 1e-4, fixed: bool = True) -> BiasSteps:
+def corrected(e: torch.Tensor, dt: float = 1.0, lost: float = 1e-4, fixed: bool = True) -> SignTest:
     """After corrections (n, B, 6) of so many of their 1σ."""
-    steps = BiasSteps.begin(e, e.shape[1])
+    steps = SignTest.begin(e, e.shape[1], 6)
     P = torch.eye(15, dtype=D).expand(e.shape[1], -1, -1)
     for one in e:
         dx = torch.zeros(e.shape[1], 15, dtype=D)
         dx[:, IMU] = one * math.sqrt(lost)
         c = Covariances(P, P, (1 - lost) * P, P[:, :6], P[:, 0, :6], dx)
-        steps = steps.update(c, torch.full((e.shape[1],), dt, dtype=D), torch.full((e.shape[1],), fixed))
+        share = torch.full((e.shape[1],), min(1.0, dt / SPACING_S), dtype=D)
+        steps = steps.update(normalise_corrections(c), torch.full((e.shape[1],), fixed), share)
     return steps
 
 
@@ -38,17 +39,17 @@ def test_the_statistic_has_a_variance_of_one():
         steps = corrected(e, dt)
         t = steps.total / steps.weight.sqrt()
         assert float(t.var()) == pytest.approx(0.973, abs=0.1)
-        assert float((steps.walk_factors() > 1).double().mean()) < 0.004
+        assert float((steps.walk_factors > 1).double().mean()) < 0.004
 
 
 def test_corrections_of_one_sign_make_the_walk_of_that_bias_grow():
     e = torch.zeros(200, 2, 6, dtype=D)
     e[:, 0, 5], e[:, 1, 1] = 2.0, -2.0
-    found = corrected(e).walk_factors()
+    found = corrected(e).walk_factors
     f, n = 1 - 1 / MEMORY, len(e)
     t = 2.0 * (1 - f**n) / (1 - f) / math.sqrt(f ** (2 * n) * MEMORY / 2 + (1 - f ** (2 * n)) / (1 - f**2))
-    expected = torch.ones(2, 2, 3, dtype=D)
-    expected[0, 1, 2] = expected[1, 0, 1] = (t / LIMIT) ** POWER
+    expected = torch.ones(2, 6, dtype=D)
+    expected[0, 5] = expected[1, 1] = (t / LIMIT) ** POWER
     assert torch.allclose(found, expected)
 
 
@@ -56,11 +57,11 @@ def test_noise_of_either_sign_and_single_outliers_show_nothing():
     e = torch.zeros(100, 2, 6, dtype=D)
     e[::2, 0], e[1::2, 0] = 10.0, -10.0  # a hundred times the variance
     e[[0, 50], 1] = 1e3
-    assert torch.equal(corrected(e).walk_factors(), torch.ones(2, 2, 3, dtype=D))
+    assert torch.equal(corrected(e).walk_factors, torch.ones(2, 6, dtype=D))
 
 
 def test_the_first_fixes_show_nothing():
-    assert torch.equal(corrected(torch.full((3, 1, 6), LARGEST, dtype=D)).walk_factors(), torch.ones(1, 2, 3, dtype=D))
+    assert torch.equal(corrected(torch.full((3, 1, 6), LARGEST, dtype=D)).walk_factors, torch.ones(1, 6, dtype=D))
 
 
 def test_epochs_without_a_fix_are_no_evidence():

@@ -10,7 +10,8 @@ walk of the bias is much smaller than the change. So where |t| is above ``LIMIT`
 (|t| / LIMIT)^``POWER``. An e counts with at most ``LARGEST``, and the sum of squares begins as after many fixes: the
 first fixes after a start and single outliers show nothing. A test for jumps with an answer that grows with the evidence
 instead of an estimate of the jump (Willsky 1976, "A survey of design methods for failure detection in dynamic
-systems").
+systems"). The same test finds a mounting that has turned (:mod:`dlkf.filters.constraint_noise`) and a wheel whose scale
+has changed (:mod:`dlkf.filters.aids.wheel_speed`), with e of their innovations.
 """
 
 from __future__ import annotations
@@ -29,33 +30,32 @@ MEMORY, SPACING_S = 20.0, 1.0  # fixes; those closer to each other than this cou
 LARGEST = 3.0  # of |e|
 
 
-class BiasSteps(NamedTuple):
-    """Fading sums over the fixes, of the biases of accelerometers and gyroscopes."""
+class SignTest(NamedTuple):
+    """Fading sums over the fixes."""
 
-    total: Tensor  # (B, 6) Σ fⁿ⁻ᵏ e
-    weight: Tensor  # (B, 6) Σ f²⁽ⁿ⁻ᵏ⁾
+    total: Tensor  # (B, k) Σ fⁿ⁻ᵏ e
+    weight: Tensor  # (B, 1) Σ f²⁽ⁿ⁻ᵏ⁾
 
     @classmethod
-    def begin(cls, like: Tensor, size: int) -> BiasSteps:
-        """Before the first fix."""
-        return cls(like.new_zeros(size, 6), like.new_full((size, 6), MEMORY / 2))
+    def begin(cls, like: Tensor, size: int, count: int) -> SignTest:
+        """Before the first fix, for so many walks."""
+        return cls(like.new_zeros(size, count), like.new_full((size, 1), MEMORY / 2))
 
-    def walk_factors(self) -> Float[Tensor, "B 2 3"]:
-        """On the 1σ of the walks, of accelerometers and gyroscopes by axis; at least 1."""
-        return widen_walk(self.total / self.weight.sqrt()).unflatten(-1, (2, 3))
+    @property
+    def walk_factors(self) -> Float[Tensor, "B k"]:
+        """On the 1σ of the walks; at least 1."""
+        return ((self.total / self.weight.sqrt()).abs() / LIMIT).clamp_min(1.0).pow(POWER)
 
-    def update(self, c: Covariances, interval_s: Float[Tensor, " B"], fixed: Bool[Tensor, " B"]) -> BiasSteps:
-        """After the correction of an epoch, ``interval_s`` after the last fix; unchanged without a fix."""
-        lost = (c.predicted - c.updated)[:, IMU, IMU].diagonal(dim1=-2, dim2=-1)
-        e = (c.dx[:, IMU] / lost.clamp_min(1e-18).sqrt()).clamp(-LARGEST, LARGEST)
-        keep = 1 - (interval_s / SPACING_S).clamp_max(1.0).unsqueeze(-1) / MEMORY
-        fixed = fixed.unsqueeze(-1)
-        return BiasSteps(
-            torch.where(fixed, keep * self.total + e, self.total),
-            torch.where(fixed, keep.square() * self.weight + 1, self.weight),
+    def update(self, e: Float[Tensor, "B k"], counts: Bool[Tensor, " B"], share: Float[Tensor, " B"]) -> SignTest:
+        """With numbers of unit variance, of drives that count; ``share`` of a fix by which the past fades."""
+        keep, counts = 1 - share.unsqueeze(-1) / MEMORY, counts.unsqueeze(-1)
+        return SignTest(
+            torch.where(counts, keep * self.total + e.clamp(-LARGEST, LARGEST), self.total),
+            torch.where(counts, keep.square() * self.weight + 1, self.weight),
         )
 
 
-def widen_walk(t: Float[Tensor, "B n"]) -> Float[Tensor, "B n"]:
-    """Factors on the 1σ of walks; at least 1."""
-    return (t.abs() / LIMIT).clamp_min(1.0).pow(POWER)
+def normalise_corrections(c: Covariances) -> Float[Tensor, "B 6"]:
+    """e of the biases of accelerometers and gyroscopes."""
+    lost = (c.predicted - c.updated)[:, IMU, IMU].diagonal(dim1=-2, dim2=-1)
+    return c.dx[:, IMU] / lost.clamp_min(1e-18).sqrt()

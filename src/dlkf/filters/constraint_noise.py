@@ -24,7 +24,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from dlkf.filters import bias_steps
+from dlkf.filters.bias_steps import SignTest
 
 FIRST, EXPECTED = 10.0, 0.25  # fixes for which a mean of so much counts at the start
 MEMORY = 300.0  # fixes
@@ -37,28 +37,19 @@ class ConstraintNoise(NamedTuple):
 
     squares: Tensor  # (B, 2) of z² over its variance, sideways and down
     fixes: Tensor  # (B, 1) how many, those long ago less
-    total: Tensor  # (B, 2) Σ fⁿ⁻ᵏ e
-    weight: Tensor  # (B, 1) Σ f²⁽ⁿ⁻ᵏ⁾
+    turn: SignTest  # of the mounting in yaw and pitch
 
     @classmethod
     def begin(cls, like: Tensor, batch_size: int) -> ConstraintNoise:
         """Before the first fix."""
         zeros = like.new_zeros
-        return cls(
-            zeros(batch_size, 2), zeros(batch_size, 1), zeros(batch_size, 2),
-            zeros(batch_size, 1) + bias_steps.MEMORY / 2,
-        )  # fmt: skip
+        return cls(zeros(batch_size, 2), zeros(batch_size, 1), SignTest.begin(like, batch_size, 2))
 
     @property
     def factor(self) -> Float[Tensor, "B 2"]:
         """On the variance of the rows."""
         mean = (FIRST * EXPECTED + self.squares) / (FIRST + self.fixes)
         return torch.maximum(mean / HIGH, (mean / LOW).clamp_max(1.0)).clamp(LEAST, MOST)
-
-    @property
-    def walk_factors(self) -> Float[Tensor, "B 2"]:
-        """On the 1σ of the walks of mounting yaw and pitch; at least 1."""
-        return bias_steps.widen_walk(self.total / self.weight.sqrt())
 
     def update(
         self,
@@ -74,9 +65,5 @@ class ConstraintNoise(NamedTuple):
         keep = 1 - counts / MEMORY
         most = sigmas**2 * (of_state + self.factor * variance)
         square = torch.minimum(z.square(), most) / (of_state + variance)
-        e = (z / (of_state + variance).sqrt()).clamp(-bias_steps.LARGEST, bias_steps.LARGEST)
-        left = 1 - counts / bias_steps.MEMORY
-        return ConstraintNoise(
-            keep * self.squares + counts * square, keep * self.fixes + counts,
-            left * self.total + counts * e, left.square() * self.weight + counts,
-        )  # fmt: skip
+        turn = self.turn.update(z / (of_state + variance).sqrt(), learns, torch.ones_like(z[:, 0]))
+        return ConstraintNoise(keep * self.squares + counts * square, keep * self.fixes + counts, turn)

@@ -104,13 +104,13 @@ class CarConstraints:
             liveliness=liveliness, noise=noise
         )
 
-    def let_mounting_turn(self, P: Float[Tensor, "B n n"], memory: CarMemory, epoch: Epoch) -> Float[Tensor, "B n n"]:
+    def widen_walks(self, P: Float[Tensor, "B n n"], memory: CarMemory, epoch: Epoch) -> Float[Tensor, "B n n"]:
         """P of an update interval with a fix, in which the mounting walks further where its innovations keep their
         sign (:mod:`dlkf.filters.constraint_noise`)."""
         if memory.noise is None or not self.states.structure:
             return P
         walk = P.new_tensor(STRUCTURE_WALK_STD[:2]).square() * epoch.span_s
-        more = torch.where(epoch.used.any(-1, keepdim=True), memory.noise.walk_factors.square() - 1, 0.0)
+        more = torch.where(epoch.used.any(-1, keepdim=True), memory.noise.turn.walk_factors.square() - 1, 0.0)
         first, P = self.states.of_structure.start, P.clone()
         P[:, first : first + 2, first : first + 2] += torch.diag_embed(more * walk)
         return P

@@ -27,7 +27,8 @@ from dlkf.base.errors import InputError
 from dlkf.base.settings import settings_from
 from dlkf.data.drive import Batch
 from dlkf.filters.aids.attach import add_sources
-from dlkf.filters.bias_steps import BiasSteps
+from dlkf.filters.aids.wheel_speed import WheelSpeed
+from dlkf.filters.bias_steps import SPACING_S, SignTest, normalise_corrections
 from dlkf.filters.branches import may_branch
 from dlkf.filters.build import build_filter
 from dlkf.filters.constraints import CarConstraints
@@ -115,7 +116,7 @@ class PlusMemory(NamedTuple):
     outage: VirtualOutage  # how much white noise there is
     errors: PositionErrors  # of the fixes
     fix_noise: FixNoise  # of those that claim too little
-    steps: BiasSteps  # whether a bias has changed
+    steps: SignTest  # whether a bias has changed
 
 
 class PlusFilter(nn.Module):
@@ -180,7 +181,7 @@ class PlusFilter(nn.Module):
         zero = zeros(B)
         outage = VirtualOutage.begin(kalman.P)
         matching, errors = Matching.begin(batch.imu, B), PositionErrors.begin(batch.imu, B)
-        fix_noise, steps = FixNoise.begin(batch.imu, B, batch.start_noise), BiasSteps.begin(batch.imu, B)
+        fix_noise, steps = FixNoise.begin(batch.imu, B, batch.start_noise), SignTest.begin(batch.imu, B, 6)
         network = self.network.start(B)
         return PlusMemory(kalman, network, zero, zero, matching, zero, outage, errors, fix_noise, steps), error
 
@@ -189,7 +190,7 @@ class PlusFilter(nn.Module):
         interval = memory.since_fix + epoch.span_s
         memory, change = self._propagate_slow_errors(memory, epoch)
         kalman, claimed = self.kalman.predict_fix(memory.kalman, epoch)
-        kalman = self._let_mounting_turn(kalman, claimed)
+        kalman = self._widen_walks(kalman, claimed)
         offered = memory.fix_noise.inflate_fix(claimed)
         kalman, epoch = self.kalman.screen_fix(kalman, offered)
         memory, of_network, noise = self._adapt_noise(memory._replace(kalman=kalman), epoch, offered)
@@ -227,11 +228,11 @@ class PlusFilter(nn.Module):
         )
         return memory._replace(kalman=kalman, outage=outage, errors=errors), change
 
-    def _let_mounting_turn(self, kalman: KalmanMemory, claimed: Epoch) -> KalmanMemory:
+    def _widen_walks(self, kalman: KalmanMemory, claimed: Epoch) -> KalmanMemory:
         """The Kalman filter with more uncertainty of the mounting, where the constraints show that it turns."""
         for source, of_source in zip(self.kalman.sources, kalman.sources, strict=True):
-            if isinstance(source, CarConstraints):
-                kalman = kalman._replace(P=source.let_mounting_turn(kalman.P, of_source, claimed))
+            if isinstance(source, CarConstraints | WheelSpeed):
+                kalman = kalman._replace(P=source.widen_walks(kalman.P, of_source, claimed))
         return kalman
 
     def _adapt_noise(
@@ -257,7 +258,7 @@ class PlusFilter(nn.Module):
         if not (may_branch(seen) and bool(seen.all())):
             gyro_noise = torch.where(seen.unsqueeze(-1), gyro_noise, 1.0)
         (levels, weight), same = memory.outage.estimates(), torch.ones_like(gyro_noise)
-        walks = memory.steps.walk_factors()
+        walks = memory.steps.walk_factors.unflatten(-1, (2, 3))
         of_network, in_force = (
             torch.cat((torch.stack((same, x), 1), walks), 1) for x in (gyro_noise, gyro_noise ** weight.unsqueeze(-1))
         )
@@ -284,7 +285,7 @@ class PlusFilter(nn.Module):
             outage=outage, errors=memory.errors.update(offered, offering, estimated, c.dx[:, self._slow]),
             fix_noise=memory.fix_noise.update(claimed, offering, outage),
             matching=memory.matching.update_ratios(c.dx, c.predicted, c.updated, end.C_nb, fixed),
-            steps=memory.steps.update(c, interval, fixed),
+            steps=memory.steps.update(normalise_corrections(c), fixed, (interval / SPACING_S).clamp_max(1.0)),
         )  # fmt: skip
 
     def _normalise_innovation(self, memory: PlusMemory, epoch: Epoch) -> Float[Tensor, "B 6"]:

@@ -114,8 +114,8 @@ MEMORY = {  # by the last parts of a field's name
     "blocks": "blocks in both",
     "evidence": "evidence for each share of the vibration's likelihood [nats]",
     "age": "time since the last fix [s]",
-    "noise.total": "fading sum of innovations across the car over their 1σ, sideways and down",
-    "noise.weight": "fading sum of the squares of its weights",
+    "turn.total": "fading sum of innovations across the car over their 1σ, sideways and down",
+    "turn.weight": "fading sum of the squares of its weights",
     "noise.squares": "sum over fixes in motion of innovation² over its variance with the 1σ as set, sideways and down",
     "noise.Q": "adapted covariance of an epoch's process noise, units of P",
     "noise.R": "adapted variance of a fix: position [m²], velocity [m²/s²]",
@@ -189,7 +189,7 @@ MEMORY = {  # by the last parts of a field's name
     "fix_noise.variance": "variance of the noise of fixes over the claimed one (of positions with 0.1 m more), by part",
     "fix_noise.fixes": "fixes that it counts for",
     "fix_noise.largest": "largest such ratio so far, of horizontal positions and velocities",
-    "steps.total": "sum of a bias' corrections over their 1σ, those long ago less, accelerometers and gyroscopes",
+    "steps.total": "fading sum of corrections over their 1σ: biases of accelerometers and gyroscopes; scale of a wheel",
     "steps.weight": "variance of that sum where the noise is right",
 }
 

@@ -18,6 +18,9 @@ sensor or a locked wheel does not stop the car. Many sensors read zero below som
 good prediction has seen that is the least 1σ of a zero, which is then no proof of a standstill. Any other value is that
 of a dead sensor, too, if it stays the same while the speed of the INS changes. A sensor without a sign is read with the
 sign of the filter's own speed.
+
+Driven wheels slip on snow or gravel for minutes, as if their scale had changed. A filter that adapts widens the walk of
+the scale where wheel and fixes differ with one sign (:meth:`WheelSpeed.widen_walks`).
 """
 
 from __future__ import annotations
@@ -35,9 +38,11 @@ from dlkf.data.drive import Batch
 from dlkf.filters.aids.rounding import rounded_measurement
 from dlkf.filters.aids.stretch import mean_force, stack_limits, stretch_weights, weighted_mean
 from dlkf.filters.aids.trust import Trust, judge
+from dlkf.filters.bias_steps import SignTest
 from dlkf.filters.integration import Epoch
 from dlkf.filters.sources import Measurement, Parameter, Predicted, SensorSource, aid_of, predicted_variance
 from dlkf.filters.stationarity import acceleration_std
+from dlkf.navigation.state import VELOCITY
 
 LEAST_STD = 0.03  # m/s: the least 1σ, whatever a file gives
 KMH = 1 / 3.6
@@ -70,6 +75,7 @@ class WheelMemory(NamedTuple):
     zone: Tensor  # (B,) m/s, the largest speed at which it has read zero
     rolling: Tensor  # (B,) bool: it turned in the last interval, and counted
     stopped: Tensor  # (B,) bool: it did not turn in the last interval, and counted
+    steps: SignTest  # of its scale
 
 
 class WheelSpeed(SensorSource):
@@ -89,7 +95,8 @@ class WheelSpeed(SensorSource):
         std = batch.imu.new_tensor([self.tuning.wheel_std])
         trust = Trust.begin(batch.imu, B)
         no = zeros > 0
-        return WheelMemory(std, trust, zeros, zeros, zeros, zeros, no, zeros, no, no)
+        steps = SignTest.begin(batch.imu, B, 1)
+        return WheelMemory(std, trust, zeros, zeros, zeros, zeros, no, zeros, no, no, steps)
 
     def rows(self, epoch: Epoch, memory: WheelMemory, prediction: Predicted) -> tuple[Measurement | None, WheelMemory]:
         """The row, and what the wheel has earned by it."""
@@ -107,7 +114,7 @@ class WheelSpeed(SensorSource):
         unsure = predicted_variance(prediction.P, H)[:, 0]
         reverse = ~memory.signed & (value > 0) & (expected < -2 * unsure.clamp_min(0).sqrt())
         value = torch.where(reverse, -value, value)
-        z = value - expected
+        z = innovation = value - expected
         same = seen & ((value - memory.last).abs() < 1e-6)
         repeats = torch.where(
             seen, torch.where(same, (memory.repeats + 1).clamp_max(ROUNDED_REPEATS), 0.0), memory.repeats
@@ -135,12 +142,36 @@ class WheelSpeed(SensorSource):
         of_cell = rounded_measurement(z, 0.5 * KMH, unsure, R)
         again = torch.where(z.abs() < 0.5 * KMH, (1 + repeats).square(), 1.0)
         z, R = torch.where(rounded, of_cell[0], z), torch.where(rounded, of_cell[1] * again, R)
+        steps = self._watch_scale(epoch, memory, prediction, innovation, H, gate, turns)
         memory = WheelMemory(
             memory.std, trust, torch.where(seen, value, memory.last), repeats, gained, whole,
             memory.signed | (used & ~reverse & (value < BACKWARDS)),
-            zone, used & turns, used & zero & (zone < RESOLVED),
+            zone, used & turns, used & zero & (zone < RESOLVED), steps,
         )  # fmt: skip
         return Measurement(z.unsqueeze(-1), H, R.unsqueeze(-1), used.unsqueeze(-1)), memory
+
+    def widen_walks(self, P: Float[Tensor, "B n n"], memory: WheelMemory, epoch: Epoch) -> Float[Tensor, "B n n"]:
+        """P of an update interval with a fix, in which the scale walks further where fixes contradict it with one sign
+        (:mod:`dlkf.filters.bias_steps`)."""
+        scale, walk = self.states.of("wheel_scale"), self.parameters["wheel_scale"].walk
+        more = torch.where(epoch.used.any(-1, keepdim=True), memory.steps.walk_factors.square() - 1, 0.0)
+        P = P.clone()
+        P[:, scale, scale] += (walk**2 * epoch.span_s * more).unsqueeze(-1)
+        return P
+
+    def _watch_scale(
+        self, epoch: Epoch, memory: WheelMemory, prediction: Predicted, z: Float[Tensor, " B"],
+        H: Float[Tensor, "B 1 n"], variance: Float[Tensor, " B"], turns: Bool[Tensor, " B"],
+    ) -> SignTest:  # fmt: skip
+        """Whether the scale has changed: the wheel's innovation less that of the fix's velocity along the car, over
+        the 1σ of both and of the scale."""
+        scale, H = self.states.of("wheel_scale"), H.squeeze(1)
+        of_fix, slope = H[:, VELOCITY], H[:, scale]
+        variance = variance + (of_fix * epoch.fix.std[:, VELOCITY]).square().sum(-1)
+        variance = variance + (slope.square() * prediction.P[:, scale, scale].squeeze(-1)).squeeze(-1)
+        apart = z - (of_fix * epoch.z[:, VELOCITY]).sum(-1)
+        e = torch.where(slope < 0, -1.0, 1.0) * (apart / variance.sqrt()).unsqueeze(-1)
+        return memory.steps.update(e, turns & epoch.used[:, VELOCITY][:, :2].all(-1), torch.ones_like(z))
 
     def _watch_gain(
         self, epoch: Epoch, memory: WheelMemory, prediction: Predicted, changed: Bool[Tensor, " B"]
