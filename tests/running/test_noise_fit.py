@@ -22,7 +22,7 @@ from dlkf.filters.tuning import Tuning
 from dlkf.navigation.imu_errors import imu_spec
 from dlkf.onboard.compiled_filter import compile_or_keep
 from dlkf.running import likelihood
-from dlkf.running.likelihood import Evidence, FixOffset, NoiseFit, find_noise, generic_filter, search_fix_offset
+from dlkf.running.noise_fit import Evidence, FixOffset, NoiseFit, find_noise, generic_filter, search_fix_offset
 from dlkf.running.start import align
 from tests.cars import IMU, car_batch, write_segments
 
