@@ -30,7 +30,6 @@ from dlkf.onboard.c_source import COLUMNS as CORE_COLUMNS
 from dlkf.onboard.c_source import EXAMPLES, list_columns, write_source
 from dlkf.onboard.check import measure_difference, write_log
 from dlkf.onboard.compiled_filter import CompiledFilter
-from dlkf.onboard.core import Core
 from dlkf.onboard.core_drives import run_core_drive
 from dlkf.onboard.functions import Turn, make_layout
 from dlkf.onboard.library import LIBRARY, Library, build, find_compiler
@@ -44,6 +43,7 @@ from dlkf.running.solution import COLUMNS, estimates_table
 from dlkf.running.start import align_drives
 from dlkf.running.streaming import StreamingFilter
 from tests.onboard.conftest import ARM, GRID, IMU, QUICK
+from tests.onboard.core import Core
 from tests.onboard.streams import calls, through_core
 from tests.shell import PATIENCE_S
 
