@@ -11,7 +11,7 @@ import lightning as L
 import numpy as np
 import torch
 
-from dlkf.base.console import ProgressCallback
+from dlkf.base.console import ProgressCallback, no_progress
 from dlkf.base.errors import InputError, list_some
 from dlkf.data.draws import combine_seed
 from dlkf.data.drive import Batch, Drive
@@ -71,7 +71,7 @@ class DriveDataModule(L.LightningDataModule):
         seed: int = 0,
         eval_seed: int = 0,
         split_seed: int = 0,
-        progress: ProgressCallback | None = None,
+        progress: ProgressCallback = no_progress,
     ) -> None:
         super().__init__()
         if dtype not in DTYPES:

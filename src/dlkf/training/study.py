@@ -220,9 +220,7 @@ def _endurance(
         if left := sorted(set(map(float, scoring.after_s)) - {a.seconds for a in after}):
             say(f"no test drive has room for an outage after {', '.join(f'{s:g}' for s in left)} s of GNSS")
     if scoring.hour:
-        drives = load_dataset(
-            scoring.hour, rate_hz=data.rate_hz, epoch_s=data.epoch_s, dtype=torch.float64, progress=None
-        )
+        drives = load_dataset(scoring.hour, rate_hz=data.rate_hz, epoch_s=data.epoch_s, dtype=torch.float64)
         hour = score_without_outage(known, drives, data.start, seed=scoring.seed)
         tables.append(hour_table(Path(scoring.hour).name, hour))
     return after, hour, tables
