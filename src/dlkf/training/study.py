@@ -41,7 +41,7 @@ from dlkf.filters.build import refuse_smoothed
 from dlkf.filters.card import describe_seen_recordings
 from dlkf.filters.integration import Estimator
 from dlkf.filters.learned_kalman import LearnedKalmanConfig
-from dlkf.filters.saved import LearnedSettings, load_filter, parse_learned_settings
+from dlkf.filters.saved import load_filter, parse_learned_settings
 from dlkf.filters.shipped import shipped_folder, trained_filter
 from dlkf.report.evaluation import write_report
 from dlkf.training.callbacks.history import read_losses
@@ -87,7 +87,9 @@ def run_study(
         baselines = _baselines(settings, data, say)
     with _time(seconds, "training"):
         card = model_card(settings, data, getattr(logger, "run_id", None))
-        model = model_on_baseline(settings.fit.model, baselines)
+        model = settings.fit.model
+        if isinstance(model, LearnedKalmanConfig):  # it has noise and prior of the filter that it is round
+            model = model.with_base(baselines.imu, baselines.tunings[model.base], baselines.priors.get(model.base))
         (folder / MODEL).write_text(yaml.safe_dump(model.as_dict(), sort_keys=False))  # for further processes
         on_baseline, mean = replace(settings.fit, model=model), baselines.prior.mean
         weights = fit(on_baseline, data, folder, logger, mean_imu_error=mean, notes=card, further=further)
@@ -160,13 +162,6 @@ def train_with_baselines(settings: StudySettings, data: DriveDataModule, folder:
     set_threads(settings.fit)
     model = parse_learned_settings(read_yaml(folder / MODEL))
     fit(replace(settings.fit, model=model), data, folder, False)
-
-
-def model_on_baseline(model: LearnedSettings, baselines: Baselines) -> LearnedSettings:
-    """The settings of a model; one round a Kalman filter (``dlkf_kalman``) has noise and prior of that baseline."""
-    if not isinstance(model, LearnedKalmanConfig):
-        return model
-    return model.with_base(baselines.imu, baselines.tunings[model.base], baselines.priors.get(model.base))
 
 
 def list_left_out_drives(settings: StudySettings, data: DriveDataModule) -> list[str]:
