@@ -23,7 +23,7 @@ WHOLE_ROOMS = {"onboard", "pipelines"}
 WHOLE_FILES = {  # that take five seconds and more
     "test_aid_logs.py", "test_aid_stream.py", "test_bank.py", "test_chassis.py", "test_configuration.py",
     "test_consistency.py", "test_datamodule.py", "test_faulty_data.py", "test_foreign_tables.py", "test_formats.py",
-    "test_likelihood.py", "test_receiver.py", "test_recorders.py", "test_recovery.py", "test_refusals.py",
+    "test_noise_fit.py", "test_receiver.py", "test_recorders.py", "test_recovery.py", "test_refusals.py",
     "test_silent_cars.py", "test_stationarity.py", "test_stores.py", "test_streaming.py", "test_tuning.py",
     "test_wheel_faults.py", "test_wrong_words.py",
 }  # fmt: skip

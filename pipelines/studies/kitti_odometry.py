@@ -21,12 +21,12 @@ import torch
 
 from dlkf.command.composing import imu_preset
 from dlkf.data.drive import Batch, Drive
+from dlkf.data.masks import find_runs
 from dlkf.data.segments import Segment, StartLaw, make_batch
 from dlkf.data.store import load_dataset
 from dlkf.data.tables import read_drives
 from dlkf.filters.smoother import Filter
 from dlkf.filters.tuning import Tuning
-from dlkf.report.plots import find_runs
 from dlkf.running.batched import run_filter
 from dlkf.tracking.models import resolve_model
 
@@ -88,7 +88,7 @@ def dead_reckoning(drives: Sequence[Drive]) -> Batch:
     """Each drive's longest time with a known attitude, from the truth, without a fix."""
     known = [(d.ref_valid & d.ref_C_eb.isfinite().flatten(1).all(-1)).numpy() for d in drives]
     runs = [max(find_runs(x), key=lambda run: run[1] - run[0]) for x in known]
-    parts = [Segment(k, first, last - first) for k, (first, last) in enumerate(runs)]
+    parts = [Segment(k, first, last - 1 - first) for k, (first, last) in enumerate(runs)]
     batch = make_batch(drives, parts, start=StartLaw(0, 0, 0, 0))
     nothing = torch.zeros_like(batch.available)
     std = START.std.expand(len(drives), 9)

@@ -57,7 +57,7 @@ from dlkf.filters.model_based import Mbkf
 from dlkf.filters.shipped import KNOWN_IMU, build_plus, trained_filter
 from dlkf.filters.tuning import Tuning
 from dlkf.onboard.compiled_filter import compile_filter, compile_or_keep
-from dlkf.running.likelihood import Evidence, find_noise
+from dlkf.running.noise_fit import Evidence, find_noise
 from dlkf.running.start import align_each
 from dlkf.simulation.dataset import simulate
 

@@ -32,7 +32,7 @@ Filters
     _prior      starts from the training drives' mean IMU error
     _nhc        non-holonomic constraints: no velocity across and down, zero velocity while stationary
     _car        these with mounting angles, rear-axle distance, sideslip and pitch gradient as states
-    _gm         biases as Gauss-Markov processes;  _gated: χ² gate on fixes;  _rts: smoothed backwards
+    _gated      χ² gate on fixes;  _rts: smoothed backwards
     plus        mbkf33_car that estimates its IMU's noise while it runs;  dlkf: a network gives gain and IMU error
     module:Class a filter of your own;  filter+module:Class: a Kalman filter with a measurement source of your own
 Tables

@@ -20,10 +20,9 @@ from dlkf.base.provenance import describe_provenance
 from dlkf.command import command, list_typed_words
 from dlkf.command.settings import NavigateSettings
 from dlkf.data.drive import Drive
-from dlkf.data.kinds import drive_rates
-from dlkf.data.store import choose_aids, dataset_digest, drive_rows, load_dataset
+from dlkf.data.store import dataset_digest, load_dataset
 from dlkf.data.tables import drive_clocks
-from dlkf.filters.aids.attach import describe_aids, find_tables, refuse_left_out, with_aids
+from dlkf.filters.aids.attach import describe_aids
 from dlkf.filters.card import domain_warnings
 from dlkf.filters.smoother import run_smoother
 from dlkf.navigation.imu_errors import AUTO
@@ -32,9 +31,9 @@ from dlkf.onboard.core_drives import run_core_drive, runs_in_core
 from dlkf.report.navigation import MOST_DRIVES, TrackOnMap, navigation_page, summary_lines
 from dlkf.running import offline
 from dlkf.running.exports import choose_formats, export, find_row_qualities, utc_times
-from dlkf.running.grid import UsableFixes, choose_grid_for_logs
+from dlkf.running.grid import RunPlan
 from dlkf.running.innovations import OF_NETWORK, REMEDY
-from dlkf.running.likelihood import check_finds_noise, generic_filter
+from dlkf.running.noise_fit import check_finds_noise, generic_filter
 from dlkf.running.replay import stream_drives
 from dlkf.running.solution import write_solution
 from dlkf.tracking.models import list_settings_taken, resolve_model, short_name, takes_tuning, unused_settings
@@ -54,15 +53,10 @@ def main(settings: NavigateSettings) -> None:
         check_finds_noise(settings.model)
     model = resolve_model(settings.model, spec, settings.tracking.uri, **settings.filter_options)
     clocks = drive_clocks(settings.dataset)
-    rows, name = drive_rows(settings.dataset, settings.drives), short_name(settings.model)
-    spacings = {row.name: UsableFixes.of(settings.dataset, row.name) for row in rows}
-    rates = drive_rates(settings.dataset, spacings)
-    step = choose_grid_for_logs(model, spacings.values(), rates.values(), settings.rate_hz, settings.epoch_s)
-    chosen = choose_aids(settings.dataset, settings.aids, settings.drives)
-    if settings.aids is not None:
-        refuse_left_out({name: model}, chosen)
-    model = with_aids(model, chosen)
-    grid = {**step, "aids": find_tables(model)}
+    name = short_name(settings.model)
+    given = {"aids": settings.aids, "drives": settings.drives, "rate_hz": settings.rate_hz, "epoch_s": settings.epoch_s}
+    model, chosen, spacings, rates, grid = RunPlan.of(settings.dataset, model, name, **given)
+    step = {key: grid[key] for key in ("rate_hz", "epoch_s")}
     for line in describe_aids({name: model}, chosen):
         print(line)
     for line in domain_warnings({name: model}, settings.dataset, rates, spec.name, grid["rate_hz"]):
@@ -99,7 +93,7 @@ def main(settings: NavigateSettings) -> None:
         many = offline.CHUNK_SAMPLES if settings.parallel is None else offline.SAMPLES_AT_ONCE // 4
         shares = offline.chunk_drives(spacings, grid["rate_hz"], 1 if settings.streaming else many)
         done = parallel_map(partial(offline.load_chunk, run, skipped is not None), shares, settings.parallel)
-        navigated = partial(offline.navigate_chunks, done, len(rows), skipped=skipped)
+        navigated = partial(offline.navigate_chunks, done, len(spacings), skipped=skipped)
     lines, courses = [], []
     taken = list_settings_taken(settings.model)
     shown = f"{name} (imu={preset})" if "imu" in taken else name

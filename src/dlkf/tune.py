@@ -23,7 +23,7 @@ from dlkf.filters.aids.attach import refuse_left_out
 from dlkf.filters.build import FilterName, build_filter
 from dlkf.filters.tuning import FittedOn
 from dlkf.onboard.compiled_filter import compile_or_keep
-from dlkf.running.likelihood import Evidence, find_noise
+from dlkf.running.noise_fit import Evidence, find_noise
 from dlkf.tracking.runs import start_run, tracking_uri
 from dlkf.tuning.study import (
     LIKELIHOOD,

@@ -133,9 +133,7 @@ def test_an_epoch_covers_the_training_time_once_from_random_starts(town):
 
 
 def test_batches_depend_on_seed_epoch_and_step_alone(town):
-    a, b = _module(town, turn_frames=True, injected_bias=BiasLaw(0.1, 0.3)), _module(
-        town, turn_frames=True, injected_bias=BiasLaw(0.1, 0.3)
-    )  # fmt: skip
+    a, b = (_module(town, injected_bias=BiasLaw(0.1, 0.3)) for _ in range(2))
     b.train_batch(0, 0), b.train_segments(7)
     for epoch, step in ((0, 2), (3, 0)):
         x, y = a.train_batch(epoch, step), b.train_batch(epoch, step)

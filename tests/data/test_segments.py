@@ -9,7 +9,6 @@ import pytest
 import torch
 
 from dlkf.base.errors import InputError
-from dlkf.data.augmentation import turn_frames
 from dlkf.data.masks import BiasLaw, add_bias, mask_outage, withhold_fixes
 from dlkf.data.segments import (
     Segment,
@@ -25,6 +24,7 @@ from dlkf.navigation.earth import EARTH_RATE, tangent_frame
 from dlkf.navigation.state import NavState
 from dlkf.navigation.strapdown import strapdown
 from dlkf.running.start import align
+from tests.turned import turn_frames
 
 EXACT = StartLaw(0.0, 0.0, 0.0, 0.0)
 

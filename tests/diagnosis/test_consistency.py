@@ -47,7 +47,7 @@ def test_the_band_holds_the_mean_of_chi_square_draws():
     assert ((draws >= low) & (draws <= high)).mean() == pytest.approx(0.95, abs=0.01)
 
 
-@pytest.mark.parametrize("name", ["mbkf15", "mbkf21", "mbkf33", "mbkf15_gm"])
+@pytest.mark.parametrize("name", ["mbkf15", "mbkf21", "mbkf33"])
 def test_a_filter_with_matching_errors_knows_how_wrong_it_is(name):
     """The mean over 24 drives and the last 40 s, of which 20 s without GNSS; errors are correlated in time, so the
     band is that of a single time."""

@@ -9,10 +9,11 @@ import plotly.graph_objects as go
 import pytest
 from plotly.subplots import make_subplots
 
+from dlkf.data.masks import find_runs
 from dlkf.report.drawing import Figure, library, panels, template
 from dlkf.report.navigation import navigation_page
 from dlkf.report.page import Page
-from dlkf.report.plots import MOST, extremes, find_runs
+from dlkf.report.plots import MOST, extremes
 from tests.evaluation.drawn import figures_of
 from tests.running.test_offline import driven
 
@@ -96,8 +97,8 @@ def test_a_page_of_drives_holds_figures_that_plotly_knows():
 
 
 def test_runs_of_true():
-    assert find_runs(np.array([True, False, True, True, False])) == [(0, 0), (2, 3)]
-    assert find_runs(np.ones(4, bool)) == [(0, 3)] and find_runs(np.zeros(3, bool)) == []
+    assert find_runs(np.array([True, False, True, True, False])) == [(0, 1), (2, 4)]
+    assert find_runs(np.ones(4, bool)) == [(0, 4)] and find_runs(np.zeros(3, bool)) == []
 
 
 def test_thinning_keeps_every_peak_and_every_gap():

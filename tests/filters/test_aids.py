@@ -11,7 +11,6 @@ import torch
 
 from dlkf.data.aid_tables import STANDARD, AidTable
 from dlkf.data.aids import ROW, aid_rows, pressure_height
-from dlkf.data.augmentation import turn_frames
 from dlkf.data.resampling import SampleGrid
 from dlkf.data.segments import whole_drives
 from dlkf.data.store import load_dataset
@@ -27,6 +26,7 @@ from dlkf.navigation.state import PVA, ErrorStates
 from dlkf.navigation.strapdown import strapdown
 from dlkf.running.start import align_each
 from tests.cars import IMU, car_batch, write_cars
+from tests.turned import turn_frames
 
 WHEEL = {"scale": 1.03, "delay_s": 0.15, "right_m": 0.6}
 

@@ -73,12 +73,14 @@ def test_prediction_of_states_that_walk_is_the_dense_one(learned_through):
     P, Q, of = (L @ L.mT).requires_grad_(), rand(5, 15, 15).requires_grad_(), rand(5, 15, 15)
     given = [P, Q, Phi.requires_grad_()] if learned_through else [P, Q]
 
-    def gradients(walking):
-        predicted = kalman_prediction(P, Phi, Q, walking=walking)
+    def gradients(predict):
+        predicted = predict(P, Phi, Q)
         of_P, *others = torch.autograd.grad((predicted * of).sum(), given)
         return predicted, torch.lerp(of_P, of_P.mT, 0.5), *others
 
-    for got, expected in zip(gradients(True), gradients(False), strict=True):
+    for got, expected in zip(
+        gradients(kalman_prediction), gradients(lambda P, Phi, Q: Phi @ P @ Phi.mT + Q), strict=True
+    ):
         assert torch.allclose(got, expected, rtol=1e-12, atol=1e-12)  # rounding
 
 
@@ -299,17 +301,6 @@ def test_mistakes_are_one_clear_line(arguments, words):
     with pytest.raises(InputError, match=words) as error:
         build_filter(imu=IMU, **arguments)
     assert "\n" not in str(error.value)
-
-
-def test_gauss_markov_biases_forget_at_the_preset_s_rates():
-    """Φ over a second: exp(−1/τ) of each sensor, to second order."""
-    imu = replace(IMU, accel=replace(IMU.accel, correlation_time=50.0), gyro=replace(IMU.gyro, correlation_time=20.0))
-    solution = integrate(scene(2, 3), build_filter("mbkf15_gm", imu), keep_covariances=True)
-    kept = solution.covariances.Phi[:, -1].diagonal(dim1=-2, dim2=-1)[:, 9:15]
-    expected = torch.tensor([math.exp(-1 / 50)] * 3 + [math.exp(-1 / 20)] * 3, dtype=torch.float64)
-    assert (kept - expected).abs().max() < 2e-3
-    walking = integrate(scene(2, 3), build_filter("mbkf15", imu), keep_covariances=True)
-    assert (walking.covariances.Phi[:, -1].diagonal(dim1=-2, dim2=-1)[:, 9:15] == 1).all()
 
 
 def test_noise_is_the_preset_s_times_the_squared_factors():

@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from dlkf.base.errors import InputError
-from dlkf.data.augmentation import turn_frames
 from dlkf.filters.build import build_filter
 from dlkf.filters.constraints import CarConstraints
 from dlkf.filters.integration import integrate
@@ -15,6 +14,7 @@ from dlkf.filters.plus import PlusConfig, PlusFilter
 from dlkf.filters.saved import build_learned_filter, load_filter, parse_learned_settings, save_filter
 from dlkf.filters.smoother import smooth
 from dlkf.networks.plus import bound_factor, window_features
+from tests.turned import turn_frames
 
 from .scene import scene
 

@@ -13,7 +13,7 @@ from dlkf.filters.gating import Gate
 from dlkf.filters.integration import integrate
 from dlkf.filters.noise_factors import NoiseFactors
 from dlkf.filters.smoother import SmoothedSolution
-from dlkf.running.likelihood import check_finds_noise
+from dlkf.running.noise_fit import check_finds_noise
 from tests.docs.pages import ROOT, blocks
 
 from .scene import IMU, scene

@@ -1,6 +1,5 @@
 """Φ against finite differences of the nonlinear strapdown, Q against Van Loan, H against its definition."""
 
-import math
 from dataclasses import replace
 
 import pytest
@@ -94,16 +93,6 @@ def test_gravity_gradient_reaches_velocity_and_position():
     assert float(gained) == pytest.approx(3.08e-6 * M * DT, rel=0.01)  # 2 g / r
     assert float(Phi[VELOCITY, POSITION][2, 2]) == pytest.approx(float(gained), rel=0.01)
     assert float(Phi[POSITION, POSITION][2, 2] - 1) == pytest.approx(float(moved - 1), rel=0.01)
-
-
-def test_gauss_markov_biases_decay():
-    """exp(−T/τ) over windows of any length T: 0.4 s and 1 s of 100 s."""
-    frame = frame_at()
-    for samples in (20, M):
-        diagonal = model_of(frame, samples=samples, decay=(1 / 100.0, 0.0)).still[0].diagonal()
-        expected = torch.tensor(math.exp(-samples * DT / 100.0), dtype=torch.float64)
-        assert torch.allclose(diagonal[ACCEL], expected, rtol=1e-12)
-        assert torch.equal(diagonal[GYRO], torch.ones(3, dtype=torch.float64))
 
 
 def continuous(C: torch.Tensor, force_n: torch.Tensor) -> torch.Tensor:

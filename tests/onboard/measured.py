@@ -23,13 +23,13 @@ from dlkf.data.store import drive_rows
 from dlkf.data.validate import CheckedTables, read_drive
 from dlkf.onboard.c_source import EXAMPLES, write_source
 from dlkf.onboard.check import Latency, write_log
-from dlkf.onboard.core import Core
 from dlkf.onboard.functions import Grid
 from dlkf.onboard.library import CORE, FILTER, build
 from dlkf.running.streaming import StreamingFilter
 from dlkf.simulation.dataset import DatasetConfig, simulate_dataset
 from dlkf.simulation.gnss.white import GnssConfig
 from tests.onboard.conftest import ARM, IMU, model_of
+from tests.onboard.core import Core
 from tests.onboard.programs import compile_program, run, stack_of_calls
 from tests.onboard.streams import METRES, SOLUTION, calls, through_core
 

@@ -15,10 +15,10 @@ from dlkf.data.aids import aid_values
 from dlkf.data.schema import ACCEL, GYRO, POSITION, STD, VELOCITY
 from dlkf.data.validate import CheckedTables
 from dlkf.onboard.c_source import COLUMNS
-from dlkf.onboard.core import Core
 from dlkf.onboard.core import Status as C
 from dlkf.running.solution import COLUMNS as SOLUTION
 from dlkf.running.streaming import Receipt, Status, StreamingFilter
+from tests.onboard.core import Core
 
 EARTH = 6.37e6  # m per radian
 METRES = {"lat_deg": np.radians(EARTH), "lon_deg": np.radians(EARTH)}

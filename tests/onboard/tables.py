@@ -21,13 +21,13 @@ from dlkf.data.validate import read_drive
 from dlkf.filters.aids.attach import with_aids
 from dlkf.filters.build import build_filter
 from dlkf.onboard.c_source import write_source
-from dlkf.onboard.core import Core, Status
 from dlkf.onboard.library import build
 from dlkf.running.streaming import StreamingFilter
 from dlkf.simulation.dataset import DatasetConfig, simulate_dataset
 from dlkf.simulation.gnss.white import GnssConfig
 from tests.cars import REAL
 from tests.onboard.conftest import ARM, GRID, IMU, KIND, SENSORS, model_of
+from tests.onboard.core import Core, Status
 from tests.onboard.faults import FAULTS
 from tests.onboard.streams import METRES, SOLUTION, Answers, Calls, calls, through_core, through_python
 

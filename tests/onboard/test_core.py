@@ -10,10 +10,10 @@ import pytest
 
 from dlkf.data.aids import pressure_height
 from dlkf.onboard.c_source import COLUMNS
-from dlkf.onboard.core import Core, Status, Waiting
 from dlkf.onboard.library import find_compiler
 from dlkf.running.streaming import StreamingFilter
 from tests.onboard.conftest import ARM
+from tests.onboard.core import Core, Status, Waiting
 from tests.onboard.faults import FAULTS, JUMPS, JUMPS_LATE, USUAL
 from tests.onboard.streams import Trunk, apart, calls, through_core
 

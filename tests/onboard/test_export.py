@@ -30,7 +30,6 @@ from dlkf.onboard.c_source import COLUMNS as CORE_COLUMNS
 from dlkf.onboard.c_source import EXAMPLES, list_columns, write_source
 from dlkf.onboard.check import measure_difference, write_log
 from dlkf.onboard.compiled_filter import CompiledFilter
-from dlkf.onboard.core import Core
 from dlkf.onboard.core_drives import run_core_drive
 from dlkf.onboard.functions import Turn, make_layout
 from dlkf.onboard.library import LIBRARY, Library, build, find_compiler
@@ -44,6 +43,7 @@ from dlkf.running.solution import COLUMNS, estimates_table
 from dlkf.running.start import align_drives
 from dlkf.running.streaming import StreamingFilter
 from tests.onboard.conftest import ARM, GRID, IMU, QUICK
+from tests.onboard.core import Core
 from tests.onboard.streams import calls, through_core
 from tests.shell import PATIENCE_S
 
@@ -150,7 +150,7 @@ def test_the_description_tells_every_number_of_the_memory(exported):
     assert re.search(r"DLKF_LAT_DEG, DLKF_LON_DEG", header)
 
 
-@pytest.mark.parametrize("kind", ["aekf_car_gated", "mbkf33_nhc_gated_gm", "dlkf", "plus"])
+@pytest.mark.parametrize("kind", ["aekf_car_gated", "mbkf33_nhc_gated", "dlkf", "plus"])
 def test_every_number_has_a_meaning(kind):
     made = {"dlkf": learned, "plus": talkative_plus}
     layout = make_layout(made[kind]() if kind in made else build_filter(kind, IMU), GRID)
@@ -391,7 +391,7 @@ def test_the_ros_2_node_says_what_the_example_does(exported, example, tables, tm
 
 
 KINDS = [
-    "ins", "aekf", "mbkf21_car", "mbkf33_nhc_gated_gm", "dlkf_literal", "dlkf", "dlkf_kalman_car", "dlkf_kalman",
+    "ins", "aekf", "mbkf21_car", "mbkf33_nhc_gated", "dlkf_literal", "dlkf", "dlkf_kalman_car", "dlkf_kalman",
     "plus",
 ]  # fmt: skip
 
@@ -400,7 +400,7 @@ KINDS = [
 @pytest.mark.parametrize(
     "estimator",
     [
-        *(lambda n=n: build_filter(n, IMU) for n in ("ins", "aekf", "mbkf21_car", "mbkf33_nhc_gated_gm")),
+        *(lambda n=n: build_filter(n, IMU) for n in ("ins", "aekf", "mbkf21_car", "mbkf33_nhc_gated")),
         learned,
         lambda: learned(outage_mode="run", frame="heading", imu_error="affine", imu_error_bound=4.0),
         lambda: learned_kalman("mbkf21_car"),

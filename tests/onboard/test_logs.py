@@ -15,11 +15,11 @@ from dlkf.data.validate import CheckedTables, read_drive
 from dlkf.filters.build import build_filter
 from dlkf.filters.shipped import trained_filter
 from dlkf.onboard.c_source import write_source
-from dlkf.onboard.core import Core
 from dlkf.onboard.library import build, find_compiler
 from dlkf.running.streaming import StreamingFilter
 from tests.cars import REAL
 from tests.onboard.conftest import ARM, GRID, IMU, QUICK
+from tests.onboard.core import Core
 from tests.onboard.streams import Calls, apart, calls, through_core, through_python
 
 pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler here")

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dlkf.onboard.core import Core
 from dlkf.onboard.library import build, find_compiler
 from dlkf.running.solution import COLUMNS
 from tests.onboard.conftest import ARM
+from tests.onboard.core import Core
 from tests.onboard.streams import METRES, calls, through_core
 
 pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler here")

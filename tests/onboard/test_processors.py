@@ -12,11 +12,11 @@ import pytest
 from dlkf.data.store import drive_rows
 from dlkf.data.validate import read_drive
 from dlkf.onboard.c_source import EXAMPLES
-from dlkf.onboard.core import Core
 from dlkf.onboard.library import CORE, FILTER, find_compiler
 from dlkf.running.solution import COLUMNS
 from tests.cars import REAL
 from tests.onboard.conftest import ARM
+from tests.onboard.core import Core
 from tests.onboard.programs import HERE, STRICT, compile_program, lines, run, stack_of_calls, tool
 from tests.onboard.streams import Calls, calls, through_core
 

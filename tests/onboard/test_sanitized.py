@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from dlkf.onboard.c_source import EXAMPLES
-from dlkf.onboard.core import Core
 from dlkf.onboard.library import find_compiler
 from tests.onboard.conftest import ARM
+from tests.onboard.core import Core
 from tests.onboard.faults import FAULTS
 from tests.onboard.programs import HERE, SANITIZED, compile_program, lines, run, tool
 from tests.onboard.streams import apart, calls, through_core

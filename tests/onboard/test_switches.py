@@ -7,10 +7,10 @@ import subprocess
 import pytest
 
 from dlkf.onboard.c_source import EXAMPLES
-from dlkf.onboard.core import Core
 from dlkf.onboard.library import CORE, FILTER, find_compiler
 from dlkf.running.solution import COLUMNS
 from tests.onboard.conftest import ARM
+from tests.onboard.core import Core
 from tests.onboard.programs import STRICT, compile_program, lines
 from tests.onboard.streams import calls, through_core
 

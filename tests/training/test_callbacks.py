@@ -56,13 +56,6 @@ def test_weights_are_large_early_and_fall_with_the_position_loss():
     assert again.weights() == weights.weights()
 
 
-def test_other_rules_of_the_weights():
-    losses = {"position": 8.0, "velocity": 2.0, "attitude": 0.01}
-    assert AdaptiveLossWeights(rule="ratio").update(losses) == {"position": 1.0, "velocity": 4.0, "attitude": 10.0}
-    equal = AdaptiveLossWeights(rule="normalised", w_max=1000).update(losses)
-    assert {t: equal[t] * losses[t] for t in losses} == pytest.approx(dict.fromkeys(losses, 1.0))
-
-
 def test_weights_ignore_a_diverged_epoch():
     weights = AdaptiveLossWeights()
     before = weights.update({"position": 4.0, "velocity": 2.0, "attitude": 1.0})
@@ -239,7 +232,6 @@ def test_guard_does_not_go_back_to_weights_that_have_diverged_already(losses):
         lambda: GnssDecimation((5, 2)),
         lambda: OutageInjection((30, 10)),
         lambda: StepGuard(slower=2.0),
-        lambda: AdaptiveLossWeights(rule="none"),
     ],
 )
 def test_settings_that_make_no_sense(make):

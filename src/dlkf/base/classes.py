@@ -52,13 +52,6 @@ def _has_method(kind: type[Any], method: str) -> bool:
     return isfunction(getattr(found, "__func__", found))
 
 
-def require_attributes(thing: Any, needs: Collection[str], what: str) -> Any:
-    """A class or an object as it is; InputError where it lacks an attribute that it ``needs``."""
-    if not all(hasattr(thing, attribute) for attribute in needs):
-        raise InputError(f"{what} has no {' and '.join(a for a in needs if not hasattr(thing, a))}")
-    return thing
-
-
 def instantiate(
     values: Mapping[str, Any],
     where: str,

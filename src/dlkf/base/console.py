@@ -24,6 +24,10 @@ LOG = "log.txt"  # beside a report
 SAY_EVERY_S = 30.0  # in a file; a terminal has a bar
 
 
+def no_progress(done: int, total: int | None) -> None:
+    """Nobody watches."""
+
+
 def make_console(width: int = 110) -> Console:
     """A console as wide as the terminal, or so many columns, that keeps its lines."""
     from rich.console import Console

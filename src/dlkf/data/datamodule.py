@@ -11,9 +11,8 @@ import lightning as L
 import numpy as np
 import torch
 
-from dlkf.base.console import ProgressCallback
+from dlkf.base.console import ProgressCallback, no_progress
 from dlkf.base.errors import InputError, list_some
-from dlkf.data.augmentation import turn_frames
 from dlkf.data.draws import combine_seed
 from dlkf.data.drive import Batch, Drive
 from dlkf.data.masks import BiasLaw, GnssNoise, Outage, add_bias, mask_outage, withhold_fixes
@@ -49,8 +48,7 @@ class DriveDataModule(L.LightningDataModule):
 
     Groups of the same name in several datasets count as one recording; drives of the same name are called
     ``<folder>/<drive>`` here. ``split`` and ``fractions`` as in
-    :func:`dlkf.data.splits.split_rows`; ``turn_frames`` and
-    ``injected_bias`` (``accel_mps2``, ``gyro_dps``: 1σ) augment training.
+    :func:`dlkf.data.splits.split_rows`; ``injected_bias`` (``accel_mps2``, ``gyro_dps``: 1σ) augments training.
     """
 
     def __init__(
@@ -68,13 +66,12 @@ class DriveDataModule(L.LightningDataModule):
         eval_stride_s: float | None = None,
         eval_outage: Outage | None = None,
         start: StartLaw | None = None,
-        turn_frames: bool = False,
         gnss_noise: GnssNoise | None = None,
         injected_bias: BiasLaw | None = None,
         seed: int = 0,
         eval_seed: int = 0,
         split_seed: int = 0,
-        progress: ProgressCallback | None = None,
+        progress: ProgressCallback = no_progress,
     ) -> None:
         super().__init__()
         if dtype not in DTYPES:
@@ -88,7 +85,7 @@ class DriveDataModule(L.LightningDataModule):
         self.batch_size, self.train_length_s = batch_size, length_s
         self.eval_length_s, self.eval_stride_s = eval_length_s, eval_stride_s
         self.eval_outage, self.injected_bias, self.gnss_noise = eval_outage, injected_bias, gnss_noise
-        self.start, self.turn_frames = start or StartLaw(), turn_frames
+        self.start = start or StartLaw()
         self.seed, self.eval_seed, self.split_seed, self.progress = seed, eval_seed, split_seed, progress
         self.length_law: Callable[[int], float] | None = None
         self._starts: dict[int, torch.Tensor] = {}
@@ -163,8 +160,6 @@ class DriveDataModule(L.LightningDataModule):
         generator = torch.Generator().manual_seed(combine_seed(self.seed, epoch, step))
         segments = self.train_segments(epoch)[step]
         batch = make_batch(self.stack, segments, dtype=self.dtype, start=self.start, generator=generator)
-        if self.turn_frames:
-            batch = turn_frames(batch, generator)
         if self.injected_bias is not None:
             noise = torch.randn(batch.size[0], 6, generator=generator, dtype=torch.float64)
             batch = add_bias(batch, self.injected_bias.std * noise)

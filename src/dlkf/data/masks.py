@@ -1,10 +1,12 @@
-"""Changes of a filter's input: withheld fixes and added IMU biases of a batch, noise on the fixes of a drive."""
+"""Changes of a filter's input: withheld fixes and added IMU biases of a batch, noise on the fixes of a drive; runs of
+flags."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -76,3 +78,9 @@ def add_bias(batch: Batch, bias: Float[Tensor, "b 6"]) -> Batch:
     bias = bias.to(batch.imu)
     imu = torch.where(batch.present[..., None, None], batch.imu + bias[:, None, None], batch.imu)
     return replace(batch, imu=imu, true_imu_error=batch.true_imu_error + bias[:, None])
+
+
+def find_runs(flags: Bool[np.ndarray | Tensor, " n"]) -> list[tuple[int, int]]:
+    """Half-open ranges in which flags are set."""
+    edges = np.flatnonzero(np.diff(np.asarray(flags), prepend=False, append=False))
+    return [(int(first), int(last)) for first, last in edges.reshape(-1, 2)]

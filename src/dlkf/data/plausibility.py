@@ -114,7 +114,7 @@ def check_gnss_units(gnss: Columns, where: str) -> None:
         remedy = "; subtract 360 where it is above 180" if lon.min() >= 0 and lon.max() <= 360 else ""
         raise InputError(f"{where}: fix {bad[0]}: lon_deg is {lon[bad[0]]:.4f}; must lie within ±180 degrees{remedy}")
     _check_places(lat, lon, where)
-    _check_way(gnss, where)
+    check_way(gnss, where)
     _check_climb(gnss, where)
 
 
@@ -146,13 +146,8 @@ def _check_places(lat: np.ndarray, lon: np.ndarray, where: str) -> None:
         )
 
 
-def check_velocities(gnss: Columns, where: str) -> None:
-    """InputError where the velocities of good fixes explain nothing of the way, in whatever unit or order."""
-    _check_way(gnss, where, unexplained=True)
-
-
-def _check_way(gnss: Columns, where: str, *, unexplained: bool = False) -> None:
-    """Displacements over stretches of ten seconds against the integral of the velocities.
+def check_way(gnss: Columns, where: str, *, unexplained: bool = False) -> None:
+    """InputError where displacements over stretches of ten seconds are not those of the velocities of good fixes.
 
     A fault only if another reading of the columns explains the way where the given one does not, or ``unexplained``
     if none does.

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import torch
 
-from dlkf.base.console import ProgressCallback
+from dlkf.base.console import ProgressCallback, no_progress
 from dlkf.base.errors import InputError, list_some
 from dlkf.base.files import folder_name, resolve_place
 from dlkf.base.parallel import parallel_map
@@ -32,7 +32,7 @@ def load_dataset(
     reference: bool = True,
     drives: Sequence[str] | None = None,
     aids: Sequence[AidTable] | None = None,
-    progress: ProgressCallback | None = None,
+    progress: ProgressCallback = no_progress,
 ) -> list[Drive]:
     """The drives of a dataset, or those named, on an epoch grid; IMU in ``dtype``, the rest float64.
 
@@ -51,8 +51,7 @@ def load_dataset(
     loaded = []
     for drive in parallel_map(load, rows, threads=threads):
         loaded.append(drive)
-        if progress is not None:
-            progress(len(loaded), len(rows))
+        progress(len(loaded), len(rows))
     return loaded
 
 

@@ -7,6 +7,7 @@ import pandas as pd
 
 from dlkf.data.discovery.motion import RESTING
 from dlkf.data.limits import EARTH_M
+from dlkf.data.masks import find_runs
 from dlkf.data.readers.frames import DriveFrames
 from dlkf.data.schema import QUALITIES, driven_distance, way_with_imu
 from dlkf.data.tables import Columns
@@ -68,8 +69,7 @@ def _standstills(gnss: pd.DataFrame) -> tuple[str, float] | None:
     """How often and how long the fixes' speed rests for ``STANDS_S``; None where it never does, or is not known."""
     t, speed = gnss["t"].to_numpy(), np.hypot(gnss["vel_n"].to_numpy(), gnss["vel_e"].to_numpy())
     resting = speed < RESTING
-    edges = np.flatnonzero(np.diff(resting, prepend=False, append=False)).reshape(-1, 2)
-    spans = [float(t[last - 1] - t[first]) for first, last in edges]
+    spans = [float(t[last - 1] - t[first]) for first, last in find_runs(resting)]
     long = [span for span in spans if span >= STANDS_S]
     return ("once" if len(long) == 1 else f"{len(long)} times", sum(long)) if long else None
 

@@ -16,7 +16,7 @@ from dlkf.data.bursts import MANY, share_at_once
 from dlkf.data.dead_sensors import check_frozen, check_repeated_fixes
 from dlkf.data.discovery.motion import find_motion
 from dlkf.data.limits import FULL_SCALE, NONE_REFUSED, Refused, screen_fixes, within_full_scale
-from dlkf.data.plausibility import check_clocks, check_gnss_units, check_imu_units, check_velocities
+from dlkf.data.plausibility import check_clocks, check_gnss_units, check_imu_units, check_way
 from dlkf.data.readers.units import DAY_S, GPS_EPOCH_UNIX, WEEK_S
 from dlkf.data.reference_checks import check_attitude, check_same_clock, check_same_place
 from dlkf.data.schema import ACCEL, ATTITUDE, GYRO, POSITION, STD, VELOCITY, stack_columns
@@ -107,7 +107,7 @@ def check_tables(tables: CheckedTables, limits: Limits = LIMITS) -> CheckedTable
     check_frozen(imu, fixes, _where(name, "imu"))
     check_repeated_fixes(fixes, _where(name, "gnss"))
     check_turns(imu, fixes, _where(name, "imu"))
-    check_velocities(fixes, _where(name, "gnss"))
+    check_way(fixes, _where(name, "gnss"), unexplained=True)
     check_clocks(imu, fixes, _where(name, "imu"))
     if truth is not None:
         _check_reference(truth, imu, fixes, _where(name, "reference"))

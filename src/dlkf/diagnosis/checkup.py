@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -168,7 +168,8 @@ def discover_findings(tables: CheckedTables) -> Iterator[CheckupResult]:
         elif finding.setting == "imu.time.offset_s":
             yield _grade_offset(finding, late, autos if all(x.sure for x in found if x.setting in CLOCKS) else "")
         elif finding.setting == "imu.axes":
-            angle = measure_turn(finding.value)
+            turn = Rotation.from_euler("ZYX", [finding.value[k] for k in ("yaw", "pitch", "roll")], degrees=True)
+            angle = math.degrees(float(turn.magnitude()))
             fine = angle < ANGLE_DEG
             text = f"pose: the sensor is turned {angle:.1f}° against the car ({finding.detail})"
             remedy = "" if fine else "; ingest with reader.imu.accel.axes=auto reader.imu.gyro.axes=auto"
@@ -196,9 +197,3 @@ def _grade_offset(finding: Finding, late: float, autos: str) -> CheckupResult:
 
 CLOCKS = ("imu.time.offset_s", "gnss.time.drift_ppm", "gnss.position.delay_s")
 ESTIMATED = "plus and filters with +receiver estimate this; for others ingest with "
-
-
-def measure_turn(angles: Mapping[str, float]) -> float:
-    """Angle of the rotation of a pose that is given as roll, pitch, yaw [°]."""
-    turn = Rotation.from_euler("ZYX", [angles[k] for k in ("yaw", "pitch", "roll")], degrees=True)
-    return math.degrees(float(turn.magnitude()))

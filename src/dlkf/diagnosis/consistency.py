@@ -21,7 +21,7 @@ from matplotlib.ticker import FixedLocator, NullLocator, ScalarFormatter
 from numpy.typing import NDArray
 from torch import Tensor
 
-from dlkf.base.console import ProgressCallback
+from dlkf.base.console import ProgressCallback, no_progress
 from dlkf.base.errors import InputError
 from dlkf.base.files import write_into
 from dlkf.data.drive import Batch
@@ -104,7 +104,7 @@ def measure_consistency(
     estimator: CovarianceEstimator,
     batch: Batch,
     matrices: Float[Tensor, "B 2 3 3"],
-    progress: ProgressCallback | None = None,
+    progress: ProgressCallback = no_progress,
 ) -> NormalisedSquares:
     """NEES and NIS of a filter over drives with errors as it models them (``matched_drives``)."""
     n, rows = estimator.states.navigation, []
@@ -123,8 +123,7 @@ def measure_consistency(
                 torch.where(part.gnss_valid.all(-1) & part.available, nis, torch.nan),
             )
         )
-        if progress is not None:
-            progress(int(index[-1]) + 1, batch.size[0])
+        progress(int(index[-1]) + 1, batch.size[0])
     return NormalisedSquares(n, batch.epoch_s, *(torch.cat(x).numpy() for x in zip(*rows)))
 
 

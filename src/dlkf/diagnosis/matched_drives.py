@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dlkf.base.console import ProgressCallback
+from dlkf.base.console import ProgressCallback, no_progress
 from dlkf.base.ranges import draw_ranges
 from dlkf.base.settings import Ranged, bounded_field, settings_from
 from dlkf.data.drive import Batch, Drive
@@ -64,7 +64,7 @@ def make_matched_drives(spec: ImuSpec, states: ErrorStates) -> ImuSpec:
 
 
 def make_matched_batch(
-    settings: MatchedDrives, spec: ImuSpec, progress: ProgressCallback | None = None
+    settings: MatchedDrives, spec: ImuSpec, progress: ProgressCallback = no_progress
 ) -> tuple[Batch, Tensor]:
     """The drives as one batch, and the units' matrices M (B, 2, 3, 3).
 
@@ -75,8 +75,7 @@ def make_matched_batch(
         drive, matrix = _drive(settings, spec, k)
         drives.append(drive)
         matrices.append(torch.from_numpy(matrix))
-        if progress is not None:
-            progress(k + 1, settings.drives)
+        progress(k + 1, settings.drives)
     epochs = min(d.epochs for d in drives)
     batch = make_batch(
         drives,

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from dlkf.base.console import ProgressCallback, show_progress
+from dlkf.base.console import ProgressCallback, no_progress, show_progress
 from dlkf.base.errors import InputError, no_drives
 from dlkf.base.parallel import parallel_map
 from dlkf.data.alignment import ALIGN, AlignConfig
@@ -150,5 +150,5 @@ def score_chunk(work: EvaluationJob, names: tuple[str, ...]) -> ChunkResult:
     return ChunkResult(names, scores, scenes.describe(), {**left_out, **scenes.skipped}, sigma, scenes.short)
 
 
-def _bar(work: EvaluationJob, title: str) -> AbstractContextManager[ProgressCallback | None]:
-    return show_progress(title) if work.shown else nullcontext()
+def _bar(work: EvaluationJob, title: str) -> AbstractContextManager[ProgressCallback]:
+    return show_progress(title) if work.shown else nullcontext(no_progress)

@@ -34,12 +34,6 @@ QUANTITIES: dict[str, str] = {
 }
 
 
-def local_axes(batch: Batch) -> torch.Tensor:
-    """C_ln (B, T, 3, 3, float64): rotates the tangent frame n to true local NED at the true position."""
-    lat, lon, _ = geodetic_from_ecef(batch.frame.to_ecef(batch.truth.p_n.double()))
-    return ned_axes(lat, lon).mT @ batch.frame.C_en.cpu().double().unsqueeze(1)
-
-
 def error_series(batch: Batch, state: NavState) -> Array:
     """Truth − estimate in true local NED, (B, T, 9): position [m], velocity [m/s], attitude log(C Ĉᵀ) [rad].
 
@@ -49,7 +43,9 @@ def error_series(batch: Batch, state: NavState) -> Array:
     estimate = NavState(*(x.detach().cpu().double() for x in state))
     truth = NavState(*(x.cpu().double() for x in batch.truth))
     error = estimate.error_to(truth).unflatten(-1, (3, 3))  # rows: position, velocity, attitude
-    error = torch.einsum("btij,btkj->btki", local_axes(batch), error).flatten(-2).numpy()
+    lat, lon, _ = geodetic_from_ecef(batch.frame.to_ecef(batch.truth.p_n.double()))
+    C_ln = ned_axes(lat, lon).mT @ batch.frame.C_en.cpu().double().unsqueeze(1)  # (B, T, 3, 3), at the true position
+    error = torch.einsum("btij,btkj->btki", C_ln, error).flatten(-2).numpy()
     known = (batch.truth_valid & batch.present).cpu().numpy()
     level = known & batch.attitude_valid.cpu().numpy()
     valid = np.concatenate((np.repeat(known[..., None], 6, -1), np.repeat(level[..., None], 3, -1)), -1)

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dlkf.base.console import ProgressCallback
+from dlkf.base.console import ProgressCallback, no_progress
 from dlkf.base.errors import InputError
 from dlkf.data.drive import Batch
 from dlkf.data.masks import withhold_fixes
@@ -31,7 +31,7 @@ def score_scenes(
     groups: Mapping[str, str] | None = None,
     kinds: Mapping[str, str] | str = "unknown",
     chunk_samples: int = CHUNK_SAMPLES,
-    progress: ProgressCallback | None = None,
+    progress: ProgressCallback = no_progress,
 ) -> Scores:
     """Run every filter over the same scenes: batches, each with the mask (B, T) of its withheld fixes.
 
@@ -55,8 +55,7 @@ def score_scenes(
             for index in chunks(batch, chunk_samples):
                 _fill(parts[-1].filters[name], index, masked.select(index).trim(), estimator)
                 done += len(index)
-                if progress is not None:
-                    progress(done, total and total * len(filters))
+                progress(done, total and total * len(filters))
     if not filters or not parts:
         raise InputError("nothing to score: give at least one filter and one segment of a drive")
     return join_scores(parts)

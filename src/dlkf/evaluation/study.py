@@ -9,7 +9,7 @@ from contextlib import AbstractContextManager
 import torch
 from torch import Tensor
 
-from dlkf.base.console import ProgressCallback, show_progress
+from dlkf.base.console import ProgressCallback, no_progress, show_progress
 from dlkf.base.errors import InputError, did_you_mean
 from dlkf.data.draws import segment_generator
 from dlkf.data.masks import BiasLaw, add_bias
@@ -29,7 +29,7 @@ def run_scenes(
     groups: Mapping[str, str] | None = None,
     law: BiasLaw | None = None,
     seed: int = 0,
-    counting: Callable[[str], AbstractContextManager[ProgressCallback | None]] = show_progress,
+    counting: Callable[[str], AbstractContextManager[ProgressCallback]] = show_progress,
 ) -> Scores:
     """Every filter over the scenes, with ``law`` once more with biases added to the IMU; ``counting`` shows how far."""
     with counting("Running filters") as progress:
@@ -42,7 +42,7 @@ def run_scenes(
 
 def inject_bias(
     scores: Scores, filters: Mapping[str, Filter], scenes: Iterable[Scene], *, law: BiasLaw, seed: int,
-    total: int | None = None, progress: ProgressCallback | None = None,
+    total: int | None = None, progress: ProgressCallback = no_progress,
 ) -> None:  # fmt: skip
     """A bias injected into every segment, and how far each filter's last estimate followed it, into the ``scores`` of
     the same filters and scenes without it.

@@ -29,7 +29,6 @@ ENDINGS: Mapping[str, str] = {
     "nhc": "non-holonomic constraints and zero-velocity updates",
     "car": "the same, with mounting angles, rear axle, sideslip and pitch gradient as states",
     "gated": "refuses outliers",
-    "gm": "biases as first-order Gauss-Markov processes",
     "rts": "smoothed backwards over the whole drive (Rauch-Tung-Striebel)",
 }
 OWN_SOURCE = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
@@ -110,7 +109,6 @@ def build_filter(name: str, imu: ImuSpec, *, tuning: Tuning | None = None, prior
         factors,
         states,
         prior=prior if has_prior(name) else None,
-        gauss_markov="gm" in endings,
         gated="gated" in endings,
         sources=tuple(sources),
         adaptive=base == "aekf",

@@ -21,17 +21,17 @@ from dlkf.navigation.state import PVA
 
 
 def kalman_prediction(
-    P: Float[Tensor, "B n n"], Phi: Float[Tensor, "B n n"], Q: Float[Tensor, "B n n"], *, walking: bool
+    P: Float[Tensor, "B n n"], Phi: Float[Tensor, "B n n"], Q: Float[Tensor, "B n n"]
 ) -> Float[Tensor, "B n n"]:
-    """Φ P Φᵀ + Q for symmetric P. ``walking``: below :data:`PVA` Φ is the identity, for what stands there walks.
+    """Φ P Φᵀ + Q for symmetric P. Below :data:`PVA` Φ is the identity, for what stands there walks.
 
-    Then fewer products do, in C and for the gradient through a Φ that is not learned; with D the rows of Φ − I above,
+    So fewer products do, in C and for the gradient through a Φ that is not learned; with D the rows of Φ − I above,
 
         Φ P Φᵀ = P + D P + P Dᵀ + D P Dᵀ,  ∂P = Φᵀ ∂P⁻ Φ = (I + D)ᵀ ∂P⁻ (I + D)
     """
-    if walking and torch.is_grad_enabled() and P.requires_grad and not Phi.requires_grad:
+    if torch.is_grad_enabled() and P.requires_grad and not Phi.requires_grad:
         return _KalmanPrediction.apply(P, Phi, Q)
-    if walking and compiled.is_recorded():
+    if compiled.is_recorded():
         return propagate_covariance(P, Phi[:, PVA]) + Q
     return torch.baddbmm(Q, Phi, torch.bmm(Phi, P).mT)
 

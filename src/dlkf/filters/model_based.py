@@ -106,15 +106,14 @@ class Mbkf:
     ``states`` gives 15 (the paper's), 21 or 33 of them. A ``prior`` replaces zero and the preset's spread as the
     initial knowledge of the IMU: with a training set's mean error these are ``mbkf15_prior``, ``mbkf33_prior``
     (paper.md 4.6).
-    ``gauss_markov`` lets the biases decay with the preset's correlation time instead of walking. ``gated`` refuses
-    outliers among the fixes, ``sources`` gives further measurements, ``adaptive``: Q and R follow the innovations.
+    ``gated`` refuses outliers among the fixes, ``sources`` gives further measurements, ``adaptive``: Q and R follow the
+    innovations.
     """
 
     imu: ImuSpec
     tuning: Tuning = field(default_factory=Tuning)
     states: ErrorStates = PLAIN
     prior: Prior | None = None
-    gauss_markov: bool = False
     gated: bool = False
     sources: tuple[Source, ...] = ()
     adaptive: bool = False
@@ -130,7 +129,7 @@ class Mbkf:
     def code(self) -> Mbkf:
         """The filter without its numeric settings, which its memory carries: two of one code do the same."""
         return replace(
-            self, imu=GENERIC_IMU, tuning=Tuning(), prior=None, gauss_markov=False,
+            self, imu=GENERIC_IMU, tuning=Tuning(), prior=None,
             sources=tuple(getattr(s, "code", s) for s in self.sources),
         )  # fmt: skip
 
@@ -150,13 +149,8 @@ class Mbkf:
             sigma = torch.cat((sigma, torch.tensor([p.std for p in of_sources], **like).expand(B, -1)), -1)
             parameters = torch.tensor([p.start for p in of_sources], **like).expand(B, -1)
             walk += [p.walk for p in of_sources]
-        decay = (0.0, 0.0)
-        if self.gauss_markov:
-            decay = (1 / self.imu.accel.correlation_time, 1 / self.imu.gyro.correlation_time)
-        windows = window_model(
-            batch.frame, batch.dt, M, self.psd(), states=self.states, decay=decay,
-            walk=torch.tensor(walk) ** 2 if walk else None,
-        )  # fmt: skip
+        of_walk = torch.tensor(walk) ** 2 if walk else None
+        windows = window_model(batch.frame, batch.dt, M, self.psd(), states=self.states, walk=of_walk)
         sources = tuple(source.begin(batch) for source in self.sources)
         noise = None
         if self.adaptive:
@@ -239,7 +233,7 @@ class Mbkf:
         Q = memory.windows.noise(Phi, None if process is None else source_scale(process, epoch.start.C_nb))
         if memory.noise is not None:
             Q = torch.where(memory.noise.settled[:, None, None], memory.noise.Q, Q)
-        predicted = kalman_prediction(memory.P, Phi, Q, walking=not self.gauss_markov)
+        predicted = kalman_prediction(memory.P, Phi, Q)
         named = {} if memory.parameters is None else self._name_parameters(memory.parameters)
         prediction = Predicted(predicted, memory.structure, named)
         fix = self.fix.rows(epoch, memory.fix, memory.noise)

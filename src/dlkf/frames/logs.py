@@ -115,7 +115,7 @@ def read_logs(
         For what cannot be read: which file, what is missing, and the setting that mends it.
     """
     from dlkf.base.classes import instantiate
-    from dlkf.data.intake import read_together
+    from dlkf.data.intake import IngestResult, read_together
 
     if not isinstance(source, (str, Path)):
         raise InputError(f"source is a {type(source).__name__}, must be the path of a file or a folder with logs")
@@ -133,7 +133,11 @@ def read_logs(
         return list(opened.read(str(place)))
     places = opened.places(place)
     made: dict[str, DriveFrames] = {}
-    for result in read_together(opened, _as_frames, places, None, skip_unsure):
+
+    def keep_frames(drive: DriveFrames) -> IngestResult:
+        return IngestResult([{"drive": drive}], [], drive.notes, drive.mapping)
+
+    for result in read_together(opened, keep_frames, places, None, skip_unsure):
         for row in result.rows:
             drive = row["drive"]
             made[drive.name] = replace(drive, notes=result.notes)
@@ -168,10 +172,3 @@ def _compose_reader(reader: str | Path, settings: Sequence[str]) -> Mapping[str,
             if (said := describe_fault(error, "ingest")) is None:
                 raise
             raise InputError(f"reader {reader}: {said}") from None
-
-
-def _as_frames(drive: DriveFrames) -> IngestResult:
-    """A drive that stays frames."""
-    from dlkf.data.intake import IngestResult
-
-    return IngestResult([{"drive": drive}], [], drive.notes, drive.mapping)

@@ -98,12 +98,11 @@ def navigate(
     import torch
 
     from dlkf.data.alignment import read_align
-    from dlkf.data.kinds import drive_rates
-    from dlkf.data.store import choose_aids, load_dataset
-    from dlkf.filters.aids.attach import describe_aids, find_tables, with_aids
+    from dlkf.data.store import load_dataset
+    from dlkf.filters.aids.attach import describe_aids
     from dlkf.filters.card import describe_slow_drives
     from dlkf.filters.smoother import run_smoother
-    from dlkf.running.grid import UsableFixes, choose_grid_for_logs
+    from dlkf.running.grid import RunPlan
     from dlkf.running.innovations import OF_NETWORK, REMEDY
     from dlkf.running.offline import navigate_drives
     from dlkf.tracking.models import short_name, takes_tuning
@@ -115,19 +114,18 @@ def navigate(
     imu_values(imu_type)  # a wrong one is refused before any work
     aids = {"speed": speed, "heading": heading, "baro": baro}
     with drive_folder(imu, gnss, None, lever_arm, aids) as folder:
-        chosen = choose_aids(folder, None)
-        estimator = with_aids(load(model, imu_type=imu_type, tuning=tuning, prior=prior), chosen)
+        estimator = load(model, imu_type=imu_type, tuning=tuning, prior=prior)
+        plan = RunPlan.of(folder, estimator, short_name(model), rate_hz=rate_hz, epoch_s=epoch_s)
+        estimator = plan.estimator
         named = {short_name(model): estimator}
-        unused = describe_aids(named, [t for t in chosen if t not in find_tables(estimator)])
-        rates = [*drive_rates(folder).values()]
-        slow = describe_slow_drives(named, rates, "this drive has")
+        unused = describe_aids(named, [t for t in plan.aids if t not in plan.grid["aids"]])
+        slow = describe_slow_drives(named, [*plan.rates.values()], "this drive has")
         if smoothed:
             estimator = run_smoother(estimator, "rts")
-        fixes = UsableFixes.of(folder, DRIVE)
-        grid = choose_grid_for_logs(estimator, [fixes], rates, rate_hz, epoch_s)
-        drives = load_dataset(folder, dtype=torch.float64, reference=False, aids=find_tables(estimator), **grid)
+        drives = load_dataset(folder, dtype=torch.float64, reference=False, **plan.grid)
         (navigated,) = navigate_drives(drives, estimator, align=read_align())
-    solution = Solution.of(navigated, fixes, short_name(model), REMEDY if takes_tuning(model) else OF_NETWORK)
+    remedy = REMEDY if takes_tuning(model) else OF_NETWORK
+    solution = Solution.of(navigated, plan.fixes[DRIVE], short_name(model), remedy)
     unfit = [navigated.sensors()[name] for name in navigated.unfit_sensors]
     for line in (*unused, *slow, *unfit, *([solution.warning] if solution.warning else [])):
         warnings.warn(line, UserWarning, stacklevel=count_calls())

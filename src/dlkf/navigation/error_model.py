@@ -46,7 +46,7 @@ class WindowModel:
 
     states: ErrorStates
     dt: float
-    still: Tensor  # (B, n, n) Φ of a window in which nothing moves: Earth rotation, gravity gradient, decay
+    still: Tensor  # (B, n, n) Φ of a window in which nothing moves: Earth rotation, gravity gradient
     left: Tensor  # (2, M) time from each sample's middle to the end, and 1: integrates once and twice
     density: Tensor  # (1, 4) S of each noise source, the same for all drives
     walk: Tensor  # (n,) variance that a window adds to the states of the car and of further sensors
@@ -192,15 +192,13 @@ def window_model(
     psd: Mapping[str, float],
     *,
     states: ErrorStates = PLAIN,
-    decay: tuple[float, float] = (0.0, 0.0),
     walk: Float[Tensor, " w"] | None = None,
 ) -> WindowModel:
     """The common part of the windows of a batch of frames.
 
     ``psd`` gives S of ``accel_noise`` [m²/s³], ``gyro_noise`` [rad²/s], ``accel_walk`` [m²/s⁵] and
-    ``gyro_walk`` [rad²/s³]. ``decay`` is 1/τ [1/s] of first-order Gauss-Markov biases (accelerometers,
-    gyroscopes), 0 for random walks. ``walk`` is the PSD of the random walks of the states of the car, and of those of
-    further sensors after them.
+    ``gyro_walk`` [rad²/s³]. ``walk`` is the PSD of the random walks of the states of the car, and of those of further
+    sensors after them.
     """
     T, n = samples * dt, states.count
     like = {"dtype": frame.earth_rate_n.dtype, "device": frame.earth_rate_n.device}
@@ -212,8 +210,6 @@ def window_model(
     still[:, VELOCITY, POSITION] = T * gradient
     still[:, VELOCITY, VELOCITY] -= 2 * T * W
     still[:, ATTITUDE, ATTITUDE] = rotation_from_vector(-T * frame.earth_rate_n)
-    for block, inverse in zip((ACCEL, GYRO), decay):
-        still[:, block, block] *= torch.exp(torch.tensor(-T * inverse, **like))
     left = T - (torch.arange(samples, **like) + 0.5) * dt
     density = torch.tensor([[psd[source] for source in SOURCES]], **like)
     drift = torch.zeros(n, **like)

@@ -15,7 +15,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any
 
-from dlkf.base.classes import TARGET, drop_spare, instantiate, require_attributes
+from dlkf.base.classes import TARGET, drop_spare, instantiate
+from dlkf.base.errors import InputError
 from dlkf.networks.cnn_lstm import NetworkConfig
 
 NETWORK = ("start", "forward", "state_dict")  # methods of a network
@@ -43,7 +44,9 @@ class OwnNetwork:
         offered = {"samples": self.samples, "flags": self.flags}
         values = {TARGET: self.target, **self.settings}
         network = instantiate(values, "model.network", NETWORK, offered=offered, spare=PAPER_FIELDS)
-        return require_attributes(network, ("width",), f"model.network.{TARGET}={self.target}")
+        if not hasattr(network, "width"):
+            raise InputError(f"model.network.{TARGET}={self.target} has no width")
+        return network
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values for a file."""

@@ -23,7 +23,7 @@ from dlkf.base.errors import InputError
 from dlkf.onboard.c_branches import find_branches, find_choice
 from dlkf.onboard.c_loops import WHOLE
 from dlkf.onboard.c_memory import C_TYPES, Block, Buffer, Expression, Rows, Tensors, View
-from dlkf.onboard.c_operations import BY_ELEMENT, COPIES, MANY, PARTS, literal, vectorise
+from dlkf.onboard.c_operations import BY_ELEMENT, COPIES, MANY, PARTS, literal, suffix, vectorise
 from dlkf.onboard.c_pieces import SUMMED, write_sum
 from dlkf.onboard.c_places import RESHAPES, Readers, find_places, is_same, operation_name
 from dlkf.onboard.c_reductions import REDUCTIONS, UNKNOWN
@@ -223,7 +223,7 @@ class Translation(Tensors):
         pattern, operands = BY_ELEMENT[name], []
         if callable(pattern):
             pattern, args = pattern(dtype, args, kwargs)
-            pattern = vectorise(pattern, shape.numel())
+        pattern = vectorise(pattern.replace("{f}", suffix(dtype)), shape.numel())
         segments = []
         for x in args:
             if isinstance(x, Expression) and x.shape == shape:

@@ -1,6 +1,7 @@
 """Core ATen operations that go element by element, as C expressions over the elements of their operands.
 
-``{0}``, ``{1}``, … stand for the operands. Where keywords or the type decide, a function gives pattern and operands.
+``{0}``, ``{1}``, … stand for the operands, ``{f}`` for the :func:`suffix` of a function. Where keywords or the type
+decide, a function gives pattern and operands.
 """
 
 from __future__ import annotations
@@ -40,15 +41,6 @@ def vectorise(pattern: str, elements: int) -> str:
     return re.sub(r"\b(expf?|tanhf|log|log1p|asinh|sin|cos)\(", r"each_\1(", pattern) if elements >= MANY else pattern
 
 
-def _make_call(name: str) -> Pattern:
-    """A function of <math.h>."""
-
-    def call_function(dtype: torch.dtype, args: list, kwargs: dict) -> tuple[str, list]:
-        return f"{name}{suffix(dtype)}({', '.join(f'{{{k}}}' for k in range(len(args)))})", args
-
-    return call_function
-
-
 def _make_sum(sign: str) -> Pattern:
     """a ± alpha b."""
 
@@ -77,14 +69,6 @@ def _power(dtype: torch.dtype, args: list, kwargs: dict) -> tuple[str, list]:
     return f"pow{suffix(dtype)}({{0}}, {{1}})", [x, n]
 
 
-def _sigmoid(dtype: torch.dtype, args: list, kwargs: dict) -> tuple[str, list]:
-    return f"1 / (1 + exp{suffix(dtype)}(-{{0}}))", args
-
-
-def _rsqrt(dtype: torch.dtype, args: list, kwargs: dict) -> tuple[str, list]:
-    return f"1 / sqrt{suffix(dtype)}({{0}})", args
-
-
 def _leaky_relu(dtype: torch.dtype, args: list, kwargs: dict) -> tuple[str, list]:
     return "({0} > 0 ? {0} : {1} * {0})", [args[0], (*args[1:], 0.01)[0]]
 
@@ -107,13 +91,13 @@ def _apply_to_first(pattern: str) -> Pattern:
 
 BY_ELEMENT: dict[str, Pattern] = {
     "add": _make_sum("+"), "sub": _make_sum("-"), "mul": "{0} * {1}", "div": "{0} / {1}", "neg": "-{0}",
-    "reciprocal": "1 / {0}", "pow": _power, "square": _make_call("square"), "rsqrt": _rsqrt,
-    "sqrt": _make_call("sqrt"), "exp": _make_call("exp"), "erf": _make_call("erf"), "log": _make_call("log"),
-    "log1p": _make_call("log1p"), "rad2deg": _rad2deg,
-    "sin": _make_call("sin"), "cos": _make_call("cos"), "asin": _make_call("asin"), "asinh": _make_call("asinh"),
-    "atan2": _make_call("atan2"), "tanh": _make_call("tanh"), "hypot": _make_call("hypot"),
-    "floor": _make_call("floor"),
-    "abs": _make_call("fabs"), "sigmoid": _sigmoid, "leaky_relu": _leaky_relu, "relu": "({0} > 0 ? {0} : 0)",
+    "reciprocal": "1 / {0}", "pow": _power, "square": "square{f}({0})", "rsqrt": "1 / sqrt{f}({0})",
+    "sqrt": "sqrt{f}({0})", "exp": "exp{f}({0})", "erf": "erf{f}({0})", "log": "log{f}({0})",
+    "log1p": "log1p{f}({0})", "rad2deg": _rad2deg,
+    "sin": "sin{f}({0})", "cos": "cos{f}({0})", "asin": "asin{f}({0})", "asinh": "asinh{f}({0})",
+    "atan2": "atan2{f}({0}, {1})", "tanh": "tanh{f}({0})", "hypot": "hypot{f}({0}, {1})",
+    "floor": "floor{f}({0})", "abs": "fabs{f}({0})", "sigmoid": "1 / (1 + exp{f}(-{0}))",
+    "leaky_relu": _leaky_relu, "relu": "({0} > 0 ? {0} : 0)",
     "maximum": "({0} > {1} ? {0} : {1})", "minimum": "({0} < {1} ? {0} : {1})", "clamp": _clamp,
     "clamp_min": _clamp, "where": "({0} ? {1} : {2})", "lerp": "{0} + {2} * ({1} - {0})", "addcmul": _addcmul,
     "eq": "{0} == {1}", "ne": "{0} != {1}", "lt": "{0} < {1}", "le": "{0} <= {1}", "gt": "{0} > {1}",

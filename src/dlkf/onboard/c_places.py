@@ -5,6 +5,7 @@ of the function into the caller's memory, a changed part into the tensor that it
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import torch
@@ -36,13 +37,9 @@ def find_places(graph: GraphModule) -> dict[Node, Place]:
         for part in parts:
             size = part.meta["val"].shape[dim]
             if part.meta["val"].numel() and part.meta["val"].dtype == node.meta["val"].dtype:
-                _note_place(places, part, node, _make_narrow(dim, start, size))
+                _note_place(places, part, node, partial(torch.narrow, dim=dim, start=start, length=size))
             start += size if part.meta["val"].numel() else 0
     return places
-
-
-def _make_narrow(dim: int, start: int, size: int) -> Callable[[Tensor], Tensor | None]:
-    return lambda whole: whole.narrow(dim, start, size)
 
 
 def _note_place(places: dict[Node, Place], part: Node, holder: Node, where: Callable[[Tensor], Tensor | None]) -> None:

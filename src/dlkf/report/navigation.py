@@ -10,12 +10,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dlkf.base.colours import COLOURS, QUALITY
+from dlkf.data.masks import find_runs
 from dlkf.data.schema import QUALITIES
 from dlkf.filters.aids.estimates import format_estimate, label_estimate
 from dlkf.report.drawing import Figure
 from dlkf.report.maps import add_track, chart, dots, join_tracks
 from dlkf.report.page import Page
-from dlkf.report.plots import Array, band, every, find_runs, line, shade, spans, stack_panels
+from dlkf.report.plots import Array, band, every, line, shade, spans, stack_panels
 from dlkf.running.grid import UsableFixes
 from dlkf.running.innovations import SETTLE, Innovation
 from dlkf.running.offline import Navigated
@@ -176,7 +177,8 @@ def route_map(courses: Sequence[TrackOnMap]) -> Figure:
     hidden = [np.where((c.without > GAP_S)[:, None], _place(c), np.nan) for c in courses]
     add(add_track(join_tracks([_place(c) for c in courses], 12_000), "with GNSS", "#0072B2", width=3), "outages")
     if any(np.isfinite(h).any() for h in hidden):
-        gaps = np.concatenate([_insert_breaks(h, share) for h in hidden])
+        runs = [[h[max(a - 1, 0) : b] for a, b in find_runs(np.isfinite(h[:, 0]))] for h in hidden]
+        gaps = np.concatenate([join_tracks(parts, share) for parts in runs])
         add(add_track(gaps, f"over {GAP_S:g} s without a fix", "#D55E00", width=5), "outages")
     for code, colour in QUALITY.items():
         seen = [np.stack((c.fixes.lat_deg, c.fixes.lon_deg), -1)[c.fixes.quality == code] for c in courses]
@@ -193,11 +195,6 @@ def route_map(courses: Sequence[TrackOnMap]) -> Figure:
         of_sigma = {"bar": "1σ [m]", "ticks": ticks, "text": label}
         add(dots(place, "horizontal 1σ", value.astype(np.float32), size=5, **of_sigma), "1σ")
     return chart(traces, {c.result.drive: _place(c) for c in courses}, groups)
-
-
-def _insert_breaks(place: Array, most: int) -> Array:
-    """Runs of known positions, thinned each, with a NaN after each."""
-    return join_tracks([place[max(a - 1, 0) : b + 1] for a, b in find_runs(np.isfinite(place[:, 0]))], most)
 
 
 def make_rows(courses: Sequence[TrackOnMap]) -> tuple[list[str], list[list[str]], list[str]]:

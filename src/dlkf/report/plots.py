@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlkf.base.colours import SHADE
+from dlkf.data.masks import find_runs
 from dlkf.report.drawing import Figure, Trace, panels
 
 Array = NDArray[np.floating]
@@ -93,10 +94,4 @@ def shade(figure: Figure, spans: Sequence[tuple[float, float]], rows: int) -> No
 
 def spans(t: Array, flags: NDArray[np.bool_]) -> list[tuple[float, float]]:
     """(from, to) of the runs of True; a run begins at the sample before it."""
-    return [(float(t[max(a - 1, 0)]), float(t[b])) for a, b in find_runs(flags)]
-
-
-def find_runs(flags: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """First and last place of each run of True."""
-    edge = np.flatnonzero(np.diff(np.concatenate(([0], flags.astype(np.int8), [0]))))
-    return [(int(a), int(b) - 1) for a, b in edge.reshape(-1, 2)]
+    return [(float(t[max(a - 1, 0)]), float(t[b - 1])) for a, b in find_runs(flags)]

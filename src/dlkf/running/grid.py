@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from dlkf.data.aid_tables import AidTable
+from dlkf.data.kinds import drive_rates
 from dlkf.data.resampling import usual_rate
+from dlkf.data.store import choose_aids, drive_rows
 from dlkf.data.tables import read_table
 from dlkf.data.validate import usable_fixes
-from dlkf.filters.aids.attach import find_kalman
+from dlkf.filters.aids.attach import find_kalman, find_tables, refuse_left_out, with_aids
 from dlkf.filters.constraints import CarConstraints
 from dlkf.filters.saved import choose_grid
 from dlkf.filters.smoother import Filter
@@ -81,3 +84,30 @@ def choose_grid_for_logs(
     the weights of the filter need it, else what uses every fix and sample."""
     usual = choose_epoch(fixes, rate_hz or usual_rate(rates), estimator)
     return choose_grid([estimator], rate_hz, epoch_s, usual, rates)
+
+
+class RunPlan(NamedTuple):
+    """A filter with the sensors of some drives, the sensors that count, by drive their fixes and IMU sample rates [Hz],
+    and the loader's options."""
+
+    estimator: Filter
+    aids: tuple[AidTable, ...]
+    fixes: dict[str, UsableFixes]
+    rates: dict[str, float]
+    grid: dict[str, Any]
+
+    @staticmethod
+    def of(
+        folder: str | Path, estimator: Filter, name: str, *, aids: Sequence[str] | str | None = None,
+        drives: Sequence[str] | None = None, rate_hz: float | None = None, epoch_s: float | None = None,
+    ) -> RunPlan:  # fmt: skip
+        """For the drives of a dataset, or those named. InputError where the filter, called ``name``, takes none of the
+        ``aids``, or cannot run on such a grid."""
+        fixes = {row.name: UsableFixes.of(folder, row.name) for row in drive_rows(folder, drives)}
+        rates = drive_rates(folder, fixes)
+        step = choose_grid_for_logs(estimator, fixes.values(), rates.values(), rate_hz, epoch_s)
+        chosen = choose_aids(folder, aids, drives)
+        if aids is not None:
+            refuse_left_out({name: estimator}, chosen)
+        estimator = with_aids(estimator, chosen)
+        return RunPlan(estimator, chosen, fixes, rates, {**step, "aids": find_tables(estimator)})

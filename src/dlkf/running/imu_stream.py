@@ -161,7 +161,9 @@ class ImuStream:
         Where the stream has ``ended``, the loader's slack before an epoch's end counts as reached, and the last
         samples are no spikes.
         """
-        done, slack, last = [], self.slack_s if ended else 0.0, self.latest if ended else self.settled
+        done, slack, last = [], 0.0, self.latest if ended else self.settled
+        if ended:
+            slack = 0.5 * min(self.step_s, self._epoch_s / self._samples)
         while last >= self.end - max(slack, 4 * math.ulp(self.end)):
             begin, count, seconds = self.boundary(self.epochs), self.until - self.epochs, None
             if self._gap is not None:
@@ -184,11 +186,6 @@ class ImuStream:
     def step_s(self) -> float:
         """The usual interval between stamps [s]; that of the grid before one is laid."""
         return self._step or self._epoch_s / self._samples
-
-    @property
-    def slack_s(self) -> float:
-        """How long before an epoch's end a drive may stop for the loader to count the epoch as whole [s]."""
-        return 0.5 * min(self.step_s, self._epoch_s / self._samples)
 
     def open(self) -> tuple[np.ndarray, float] | None:
         """As many samples (1, M, 6) as an epoch has, from its beginning to :attr:`settled`, and their length [s]."""

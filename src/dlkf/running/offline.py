@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 import torch
 
-from dlkf.base.console import ProgressCallback
+from dlkf.base.console import ProgressCallback, no_progress
 from dlkf.base.errors import InputError, no_drives
 from dlkf.data.alignment import SEARCH, AlignConfig, Start
 from dlkf.data.drive import Batch, Drive
@@ -201,7 +201,7 @@ def navigate_chunks(
     count: int,
     *,
     skipped: dict[str, str] | None = None,
-    progress: ProgressCallback | None = None,
+    progress: ProgressCallback = no_progress,
 ) -> Iterator[Navigated]:
     """The solutions of ``count`` drives, share by share; InputError where no drive of any could start."""
     done, any_ran = 0, False
@@ -211,8 +211,7 @@ def navigate_chunks(
         any_ran |= bool(share.results)
         yield from share.results
         done += share.count
-        if progress is not None:
-            progress(done, count)
+        progress(done, count)
     if not any_ran:
         raise no_drives(skipped)
 
@@ -237,7 +236,7 @@ def navigate_drives(
     *,
     align: AlignConfig = SEARCH,
     skipped: dict[str, str] | None = None,
-    progress: ProgressCallback | None = None,
+    progress: ProgressCallback = no_progress,
 ) -> Iterator[Navigated]:
     """Run a filter over whole drives, from the first moment at which each can be aligned by ``align``.
 
@@ -266,8 +265,7 @@ def navigate_drives(
         for row, k in enumerate(part):
             yield _solve_drive(drives[k], starts[k], batch, row, solution, estimator, align)
         done += len(part)
-        if progress is not None:
-            progress(done, len(todo))
+        progress(done, len(todo))
 
 
 def _forms(estimator: Filter, drives: int) -> AbstractContextManager:

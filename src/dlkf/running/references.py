@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from dlkf.base.console import ProgressCallback
+from dlkf.base.console import ProgressCallback, no_progress
 from dlkf.base.errors import InputError
 from dlkf.data.alignment import AlignConfig
 from dlkf.data.drive import Drive
@@ -61,7 +61,7 @@ def check_reference(kind: str) -> None:
 
 
 def make_reference(
-    drives: Sequence[Drive], kind: str, estimator: Mbkf, align: AlignConfig, progress: ProgressCallback | None = None
+    drives: Sequence[Drive], kind: str, estimator: Mbkf, align: AlignConfig, progress: ProgressCallback = no_progress
 ) -> ReferencedDrives:
     """The drives with their smoothed solution (``smoothed``) or their good fixes (``gnss``) as reference.
 
@@ -98,8 +98,7 @@ def make_reference(
         found["ref_r_e"][rows], found["ref_v_e"][rows], found["ref_valid"][rows] = r_e, v_e, sure
         sigmas.append(sigma[sure])
         made.append(replace(drive, **found))
-        if progress is not None:
-            progress(k + 1, len(drives))
+        progress(k + 1, len(drives))
     if not made:
         raise InputError(f"reference={kind}: {next(iter(skipped.values()), 'no drives')}")
     sigma = torch.cat(sigmas)

@@ -13,7 +13,7 @@ from typing import Protocol, TypeVar
 import numpy as np
 import torch
 
-from dlkf.base.console import ProgressCallback
+from dlkf.base.console import ProgressCallback, no_progress
 from dlkf.base.errors import InputError, no_drives
 from dlkf.data.aid_tables import STANDARD, AidTable
 from dlkf.data.aids import LARGEST_VALUE, aid_values
@@ -163,7 +163,7 @@ def stream_drives(
     drives: Sequence[str] | None = None,
     aids: Sequence[AidTable] | None = None,
     skipped: dict[str, str] | None = None,
-    progress: ProgressCallback | None = None,
+    progress: ProgressCallback = no_progress,
     through: Callable[..., Navigated] = stream_drive,
 ) -> Iterator[Navigated]:
     """The drives of a dataset, or those named, each ``through`` a stream of its own; no reference is read.
@@ -186,7 +186,6 @@ def stream_drives(
         else:
             solved += 1
             yield result
-        if progress is not None:
-            progress(k + 1, len(rows))
+        progress(k + 1, len(rows))
     if not solved:
         raise no_drives(skipped)

@@ -128,7 +128,7 @@ def simulate_drive(
     route = random_route(motion_rng, vehicle, float(duration_s))
     car = draw_car(chassis_rng, config.chassis)
     axle = follow_route(route, vehicle, t)
-    is_point = config.chassis.is_point and not vehicle.is_banked
+    is_point = config.chassis.is_point and vehicle.bank_std <= 0 and vehicle.superelevation <= 0
     truth = axle if is_point else apply_mounting(chassis_rng, car, route, axle)
     true_imu = interval_means(truth, parts) if config.imu_parts else inverse_mechanisation(truth)
     t, axle, truth = t[::parts], *(x.at(slice(None, None, parts)) for x in (axle, truth))

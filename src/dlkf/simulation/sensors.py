@@ -18,11 +18,11 @@ from dlkf.base.errors import InputError
 from dlkf.base.settings import Ranged, bounded_field
 from dlkf.data.aids import EXPONENT, SCALE_M, SEA_LEVEL_PA
 from dlkf.navigation.attitude import rotation_from_rpy
+from dlkf.simulation.motion.routes import KMH
 from dlkf.simulation.motion.vehicle import Truth
 
 Array = NDArray[np.floating]
 FAST = 30.0  # m/s at which the growth of a tyre is given
-KMH = 1 / 3.6
 
 
 @dataclass(frozen=True)

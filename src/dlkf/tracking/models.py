@@ -12,7 +12,6 @@ from dlkf.base.documents import read_yaml
 from dlkf.base.errors import InputError, did_you_mean
 from dlkf.base.own_code import find_missing_modules
 from dlkf.filters.build import OWN_SOURCE, build_filter, describe_filters, filter_names, is_filter
-from dlkf.filters.integration import Estimator
 from dlkf.filters.saved import CONFIG, WEIGHTS, load_filter
 from dlkf.filters.shipped import KNOWN_IMU, build_plus, shipped_folder
 from dlkf.filters.smoother import Filter, run_smoother
@@ -44,7 +43,8 @@ def resolve_model(
     if is_filter(spec):
         return build_filter(spec, imu, tuning=tuning, prior=prior)
     if OWN_SOURCE.fullmatch(spec):
-        return own_filter(spec, imu)
+        kind = find_class(spec, "model", ("begin", "step"))
+        return kind(imu=imu) if "imu" in signature(kind).parameters else kind()
     if spec.endswith("_rts") and not Path(spec).expanduser().exists():
         causal = resolve_model(spec.removesuffix("_rts"), imu, tracking_uri, tuning=tuning, prior=prior)
         return run_smoother(causal, "rts")
@@ -108,15 +108,6 @@ def model_folder(spec: str) -> Path:
         raise InputError(f"model={spec}: neither plus nor a folder with {WEIGHTS} and {CONFIG}")
     load_filter(folder)
     return folder
-
-
-def own_filter(spec: str, imu: ImuSpec) -> Estimator:
-    """A user's estimator from ``module:Class``, given the IMU's preset if its class takes an argument ``imu``.
-
-    Raises InputError where there is none.
-    """
-    kind = find_class(spec, "model", ("begin", "step"))
-    return kind(imu=imu) if "imu" in signature(kind).parameters else kind()
 
 
 def resolve_models(

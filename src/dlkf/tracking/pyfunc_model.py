@@ -51,20 +51,14 @@ class NavigationFilter(PythonModel):
         import numpy as np
         import torch
 
-        from dlkf.data.kinds import drive_rates
         from dlkf.data.rows import split_drives
-        from dlkf.data.store import choose_aids, drive_from_tables, drive_rows, load_dataset
-        from dlkf.filters.aids.attach import find_tables, with_aids
-        from dlkf.running.grid import UsableFixes, choose_grid_for_logs
+        from dlkf.data.store import drive_from_tables, load_dataset
+        from dlkf.running.grid import RunPlan, UsableFixes, choose_grid_for_logs
 
         if "dataset" in given and given["dataset"].notna().any():
             for folder in given["dataset"].dropna().explode():  # MLflow puts a list of words into one cell
-                rates = [*drive_rates(folder).values()]
-                fixes = [UsableFixes.of(folder, row.name) for row in drive_rows(folder)]
-                grid = choose_grid_for_logs(self.filter, fixes, rates)
-                estimator = with_aids(self.filter, choose_aids(folder, None))
-                options = {**grid, "reference": False, "aids": find_tables(estimator)}
-                yield folder, load_dataset(folder, dtype=torch.float64, **options), estimator
+                plan = RunPlan.of(folder, self.filter, "model")
+                yield folder, load_dataset(folder, dtype=torch.float64, reference=False, **plan.grid), plan.estimator
             return
         arm = [float(params.get(f"lever_arm_{a}_m", 0.0)) for a in "xyz"]
         tables = list(split_drives(given, arm))

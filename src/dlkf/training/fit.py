@@ -48,7 +48,8 @@ def fit(
     ``mean_imu_error`` (6) of the training segments is where a model with ``known_from=training`` starts; ``notes`` are
     stored beside the weights. Raises InputError where no epoch had a finite ``monitor``.
     """
-    plan, monitor, best = settings.trainer, _monitor(settings.trainer.monitor, data), folder / BEST
+    plan, best = settings.trainer, folder / BEST
+    monitor = plan.monitor or ("val/loss" if data.eval_outage is None else "val/outage_end_m")
     module = FilterTraining(settings.model, settings.loss, settings.descent, settings.seed)
     last = folder / LAST
     if settings.finetune:
@@ -62,7 +63,9 @@ def fit(
             max_epochs=plan.max_epochs,
             accelerator=plan.accelerator,
             devices=plan.devices,
-            strategy="auto" if plan.devices == 1 else _make_strategy(),
+            strategy="auto"
+            if plan.devices == 1
+            else DDPStrategy(find_unused_parameters=True, cluster_environment=LightningEnvironment()),
             logger=logger,
             callbacks=[
                 *settings.callbacks,
@@ -156,13 +159,3 @@ def check_fit(settings: FitSettings, data: DriveDataModule) -> None:
 def _hush() -> None:
     for name in ("lightning.pytorch", "lightning.fabric"):
         logging.getLogger(name).setLevel(logging.ERROR)
-
-
-def _make_strategy() -> DDPStrategy:
-    """Gradients averaged over the processes; weights that a batch did not need may miss one."""
-    return DDPStrategy(find_unused_parameters=True, cluster_environment=LightningEnvironment())
-
-
-def _monitor(chosen: str | None, data: DriveDataModule) -> str:
-    """What the weights are kept by: the error at the end of validation outages, the loss where there are none."""
-    return chosen or ("val/loss" if data.eval_outage is None else "val/outage_end_m")

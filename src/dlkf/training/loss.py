@@ -87,7 +87,8 @@ def pva_losses(solution: BatchSolution, batch: Batch, config: LossConfig) -> dic
     known = batch.truth_valid & batch.present & sound
     losses = {}
     if config.outage:
-        losses["outage"] = config.outage * outage_term(solution, batch, known)
+        grown = torch.log1p(_horizontal(solution, batch).square().sum(-1))
+        losses["outage"] = config.outage * _mean(grown, known & ~batch.available)
     if config.likelihood:
         losses["likelihood"] = config.likelihood * likelihood_term(solution, batch, known)
     total = config.prior + config.posterior
@@ -113,11 +114,6 @@ def pva_losses(solution: BatchSolution, batch: Batch, config: LossConfig) -> dic
             value = value + weight / total * torch.where(keep, each, torch.zeros_like(each)).sum() / count
         losses[term] = value
     return losses
-
-
-def outage_term(solution: BatchSolution, batch: Batch, known: Bool[Tensor, "B T"]) -> Tensor:
-    """Mean over the epochs without GNSS of those with known truth; 0 without any."""
-    return _mean(torch.log1p(_horizontal(solution, batch).square().sum(-1)), known & ~batch.available)
 
 
 def likelihood_term(solution: BatchSolution, batch: Batch, known: Bool[Tensor, "B T"]) -> Tensor:

@@ -41,7 +41,7 @@ from dlkf.filters.build import refuse_smoothed
 from dlkf.filters.card import describe_seen_recordings
 from dlkf.filters.integration import Estimator
 from dlkf.filters.learned_kalman import LearnedKalmanConfig
-from dlkf.filters.saved import LearnedSettings, load_filter, parse_learned_settings
+from dlkf.filters.saved import load_filter, parse_learned_settings
 from dlkf.filters.shipped import shipped_folder, trained_filter
 from dlkf.report.evaluation import write_report
 from dlkf.training.callbacks.history import read_losses
@@ -87,7 +87,9 @@ def run_study(
         baselines = _baselines(settings, data, say)
     with _time(seconds, "training"):
         card = model_card(settings, data, getattr(logger, "run_id", None))
-        model = model_on_baseline(settings.fit.model, baselines)
+        model = settings.fit.model
+        if isinstance(model, LearnedKalmanConfig):  # it has noise and prior of the filter that it is round
+            model = model.with_base(baselines.imu, baselines.tunings[model.base], baselines.priors.get(model.base))
         (folder / MODEL).write_text(yaml.safe_dump(model.as_dict(), sort_keys=False))  # for further processes
         on_baseline, mean = replace(settings.fit, model=model), baselines.prior.mean
         weights = fit(on_baseline, data, folder, logger, mean_imu_error=mean, notes=card, further=further)
@@ -162,13 +164,6 @@ def train_with_baselines(settings: StudySettings, data: DriveDataModule, folder:
     fit(replace(settings.fit, model=model), data, folder, False)
 
 
-def model_on_baseline(model: LearnedSettings, baselines: Baselines) -> LearnedSettings:
-    """The settings of a model; one round a Kalman filter (``dlkf_kalman``) has noise and prior of that baseline."""
-    if not isinstance(model, LearnedKalmanConfig):
-        return model
-    return model.with_base(baselines.imu, baselines.tunings[model.base], baselines.priors.get(model.base))
-
-
 def list_left_out_drives(settings: StudySettings, data: DriveDataModule) -> list[str]:
     """A line for every side on drives that are too short for its segments, at the full length of a curriculum."""
     return data.list_left_out(longest_segment_s(settings.fit, data))
@@ -220,9 +215,7 @@ def _endurance(
         if left := sorted(set(map(float, scoring.after_s)) - {a.seconds for a in after}):
             say(f"no test drive has room for an outage after {', '.join(f'{s:g}' for s in left)} s of GNSS")
     if scoring.hour:
-        drives = load_dataset(
-            scoring.hour, rate_hz=data.rate_hz, epoch_s=data.epoch_s, dtype=torch.float64, progress=None
-        )
+        drives = load_dataset(scoring.hour, rate_hz=data.rate_hz, epoch_s=data.epoch_s, dtype=torch.float64)
         hour = score_without_outage(known, drives, data.start, seed=scoring.seed)
         tables.append(hour_table(Path(scoring.hour).name, hour))
     return after, hour, tables

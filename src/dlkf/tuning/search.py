@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dlkf.base.console import ProgressCallback, show_progress, warn_once
+from dlkf.base.console import ProgressCallback, no_progress, show_progress, warn_once
 from dlkf.base.errors import InputError
 from dlkf.data.drive import Batch
 from dlkf.evaluation.metrics import PVA, end_errors, geometric_mean, mean_error, segment_errors
@@ -104,7 +104,7 @@ def tune_filter(
     objective: str = "log",
     rounds: int = 2,
     prior: Prior | None = None,
-    progress: ProgressCallback | None = None,
+    progress: ProgressCallback = no_progress,
 ) -> tuple[Tuning, float, list[Trial]]:
     """Over-bounding factors of a filter by coordinate search on training segments.
 
@@ -137,8 +137,7 @@ def tune_filter(
                     trial = replace(best, **{factor: value})
                     error = evaluate(trial)
                     trials.append(Trial(factor, value, error))
-                    if progress is not None:
-                        progress(len(trials), most)
+                    progress(len(trials), most)
                     worse = 0 if error < score else worse + 1
                     if error < score:
                         best, score = trial, error

@@ -26,10 +26,10 @@ from dlkf.evaluation.table import ResultTable, as_markdown, format_number
 from dlkf.filters.build import FilterName, build_causal, has_prior, is_filter
 from dlkf.filters.tuning import FittedOn, Prior, Tuning
 from dlkf.navigation.imu_errors import ImuSpec
-from dlkf.running.likelihood import NO_OFFSET, NoiseFit
+from dlkf.running.noise_fit import NO_OFFSET, NoiseFit
 from dlkf.tuning.search import Trial, evaluate_objective, tune_under_bar
 
-LIKELIHOOD = "likelihood"  # the objective that needs no reference (dlkf.running.likelihood)
+LIKELIHOOD = "likelihood"  # the objective that needs no reference (dlkf.running.noise_fit)
 OF_OUTAGES = "log, rms, median: horizontal error at the end of the outages [m], geometric mean, RMS, median over them."
 OF_SEGMENTS = (
     "pva: geometric mean of the RMS of position [m], velocity [m/s] and attitude [rad] over each segment. "

@@ -8,6 +8,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from dlkf.data.masks import find_runs
 from dlkf.data.store import load_dataset
 from dlkf.navigation.attitude import vector_from_rotation
 from dlkf.navigation.earth import EARTH_RATE
@@ -16,7 +17,6 @@ from dlkf.running.start.standstill import (
     carry_attitude_back,
     carry_std,
     rest_around,
-    runs,
     stationary_epochs,
     stationary_gyros,
 )
@@ -45,10 +45,10 @@ def _parked(drive, seconds: int, noise: float = 0.0):
 def test_a_standstill_is_quiet_and_stays_where_it_is(drive):
     parked = _parked(drive, 10)
     # the tenth second ends with a fix in motion, so it is not sure to be one of rest
-    assert runs(stationary_epochs(parked)) == [(0, 9)] and not stationary_epochs(drive).any()
+    assert find_runs(stationary_epochs(parked)) == [(0, 9)] and not stationary_epochs(drive).any()
     shaken = replace(parked, imu=parked.imu.clone())
     shaken.imu[4, ::2, 0] += 2.0
-    assert runs(stationary_epochs(shaken)) == [(0, 4), (5, 9)]
+    assert find_runs(stationary_epochs(shaken)) == [(0, 4), (5, 9)]
     assert [rest_around(stationary_epochs(shaken), k) for k in (4, 5, 7)] == [slice(0, 4), slice(5, 9), slice(5, 9)]
     unseen = replace(parked, gnss_valid=torch.zeros_like(parked.gnss_valid))
     assert not stationary_epochs(unseen).any()
@@ -61,7 +61,7 @@ def test_a_standstill_is_quiet_and_stays_where_it_is(drive):
 def test_positions_tell_a_standstill_where_there_are_no_velocities(drive):
     blind = _parked(drive, 10)
     blind = replace(blind, gnss_valid=blind.gnss_valid & (torch.arange(6) < 3))
-    assert runs(stationary_epochs(blind)) == [(0, 10)]
+    assert find_runs(stationary_epochs(blind)) == [(0, 10)]
     coarse = replace(blind, gnss_std=blind.gnss_std + 1.0)  # a metre: a crawl could hide in it
     assert not stationary_epochs(coarse).any()
 

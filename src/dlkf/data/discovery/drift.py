@@ -95,7 +95,8 @@ def _settle_drift(t: Floats, accel: Floats, gyro: Floats, gnss: Motion, drift: f
     """The pose on a clock that runs faster by ``drift``, and what is left of that taken off, until it is little."""
     pose = None
     for _ in range(ROUNDS):
-        pose = find_pose(t, accel, gyro, stretch_time(gnss, drift), lag_s)
+        stretched = replace(gnss, t=gnss.t + drift * (gnss.t - middle(gnss)))
+        pose = find_pose(t, accel, gyro, stretched, lag_s)
         if pose is None:
             return None
         left, drift, lag_s = pose.drift, drift + pose.drift, pose.lag_s
@@ -113,8 +114,3 @@ def ends_std(pose: Pose, reach_s: float) -> float:
 def middle(gnss: Motion) -> float:
     """The time about which a drift stretches."""
     return 0.5 * float(gnss.t[0] + gnss.t[-1])
-
-
-def stretch_time(gnss: Motion, drift: float) -> Motion:
-    """On a clock that runs faster by ``drift``; velocities stay."""
-    return replace(gnss, t=gnss.t + drift * (gnss.t - middle(gnss)))

@@ -196,8 +196,11 @@ class AutoReader:
 def _recognise_files(folder: Path, known: Known) -> list[Contents]:
     """What the files of a folder hold; of one whose files are known by their names, that."""
     for name, files in LAYOUTS.items():
-        if all((folder / file).is_file() for file in files) and _has_its_columns(folder / files[0], name):
-            base, first = read_preset("reader", name), folder / files[0]
+        first = folder / files[0]
+        if not all((folder / file).is_file() for file in files):
+            continue
+        if name != "phyphox" or b"Time (s)" in first.open("rb").read(200):  # Sensor Logger calls its files the same
+            base = read_preset("reader", name)
             options = text_options(first) if first.suffix == ".csv" else {}
             marks = {"text": {key: options[key] for key in ("separator", "decimal") if key in options}}
             specs = leave_open({kind: {**base[kind], **marks} for kind in ("imu", "gnss")})
@@ -205,11 +208,6 @@ def _recognise_files(folder: Path, known: Known) -> list[Contents]:
                 specs["baro"] = {**base["baro"], **marks, "file": beside}
             return [Contents(first, [Offer(first, f"layout of {name}", specs)])]
     return [recognise_file(p, known) for p in sorted(folder.iterdir()) if p.is_file() and not p.name.startswith(".")]
-
-
-def _has_its_columns(path: Path, layout: str) -> bool:
-    """Whether a file of phyphox has its columns: Sensor Logger calls its files the same."""
-    return layout != "phyphox" or b"Time (s)" in path.open("rb").read(200)
 
 
 def _describe_files(within: Iterable[Contents], offers: Iterable[Offer] = ()) -> str:

@@ -113,7 +113,7 @@ class Mapped:
                 if np.mean(numbers.isna()) > 0.5 and str(name) == str(self.time.get("column")):
                     remedy = f"set reader.{self.kind}.time.unit=iso if that is a date and time"
                 if DECIMAL_COMMA.fullmatch(texts.iloc[bad[0]]):
-                    remedy = self._text_to_set("decimal", ",")
+                    remedy = f"set reader.decimal=',' (+reader.{self.kind}.text.decimal=',' for this file alone)"
                 self.fail(int(bad[0]), name, f"is {values.iloc[bad[0]]!r}, not a number; {remedy}")
             values = numbers
         if not nan and bool(values.isna().any()):
@@ -245,9 +245,6 @@ class Mapped:
                 f"{self.table.path}: no column {name!r}; has {list_some(have, MOST_NAMED)}; {self._entry_to_set(name)}"
             )
         return self.table.frame[name]
-
-    def _text_to_set(self, key: str, value: str) -> str:
-        return f"set reader.{key}={value!r} (+reader.{self.kind}.text.{key}={value!r} for this file alone)"
 
     def _entry_to_set(self, name: str) -> str:
         """The key that names a column which is not there; an entry that a log need not have may be null."""

@@ -9,8 +9,8 @@ the factor w ≥ 1 on its variance R is a running median, which outliers hardly 
 number of measurements where (zₖ − zₖ₋₁)² is above the median 2 · 0.455 w R, else down, to a 1σ of ``MOST_STD`` at most.
 
 The tangent frame's North differs from North at the car by the convergence of the meridians, e tan φ / R, with e the
-way East. Both are written with the Earth's axis in n, (cos φ, 0, −sin φ) or the same turned about down
-(:func:`dlkf.data.augmentation.turn_frames`): a measured heading is the angle from the first axis of n.
+way East. Both are written with the Earth's axis in n, (cos φ, 0, −sin φ) or the same turned about down: a measured
+heading is the angle from the first axis of n.
 """
 
 from __future__ import annotations

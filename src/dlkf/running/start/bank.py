@@ -163,7 +163,8 @@ def begin_bank(cases: Sequence[Case]) -> Bank:
     C_nb = torch.cat(C)
     bank = batch.select(torch.arange(len(cases)).repeat_interleave(COUNT))
     # the lever arm as the attitude has it
-    rate_b = torch.stack([_rate_after(c.drive) for c in cases]).repeat_interleave(COUNT, 0)
+    after = [c.drive.imu[0, : max(1, round(RATE_AVERAGE_S * c.drive.rate_hz)), 3:] for c in cases]
+    rate_b = torch.stack([rates.double().mean(0) for rates in after]).repeat_interleave(COUNT, 0)
     less, arm = bank.start.C_nb - C_nb, bank.lever_arm_b[..., None]
     p = bank.start.p_n + (less @ arm)[..., 0]
     v = bank.start.v_n + (less @ torch.linalg.cross(rate_b, bank.lever_arm_b)[..., None])[..., 0]
@@ -273,7 +274,3 @@ def bank_filter() -> Mbkf:
     """The filter of a bank."""
     tuning = Tuning(lateral_std=0.5, vertical_std=0.5)
     return BankFilter(ANY_IMU, tuning, gated=True, sources=(Sideslip(tuning, PLAIN),))
-
-
-def _rate_after(drive: Drive) -> Float[Tensor, " 3"]:
-    return drive.imu[0, : max(1, round(RATE_AVERAGE_S * drive.rate_hz)), 3:].double().mean(0)

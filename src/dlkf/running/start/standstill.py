@@ -15,6 +15,7 @@ from torch import Tensor
 
 from dlkf.data.alignment import SPREAD_STD
 from dlkf.data.drive import Drive
+from dlkf.data.masks import find_runs
 from dlkf.navigation.attitude import prefix_rotations
 from dlkf.navigation.earth import EARTH_RATE
 
@@ -51,21 +52,15 @@ def stationary_epochs(drive: Drive) -> Bool[Tensor, " epochs"]:
     still = torch.where(known[1:] & known[:-1], slow[1:] & slow[:-1], near & fixed[1:] & fixed[:-1])
     rest = quiet & still
     shortest = max(1, round(SHORTEST_REST_S / drive.epoch_s))
-    for first, last in runs(rest):
+    for first, last in find_runs(rest):
         if last - first < shortest:
             rest[first:last] = False
     return rest
 
 
-def runs(flags: Bool[Tensor, " n"]) -> list[tuple[int, int]]:
-    """Half-open ranges in which flags are set."""
-    edge = torch.diff(torch.nn.functional.pad(flags.long(), (1, 1)))
-    return list(zip(torch.nonzero(edge == 1).flatten().tolist(), torch.nonzero(edge == -1).flatten().tolist()))
-
-
 def rest_around(rest: Bool[Tensor, " epochs"], row: int) -> slice:
     """The epochs at rest that boundary ``row`` is part of."""
-    return next(slice(first, last) for first, last in runs(rest) if first <= row <= last)
+    return next(slice(first, last) for first, last in find_runs(rest) if first <= row <= last)
 
 
 @dataclass(frozen=True)
@@ -111,7 +106,7 @@ def carry_level(
 ) -> tuple[Float[Tensor, " 3"], float] | None:
     """Mean specific force [m/s²] of the last standstill before boundary ``row`` in the axes there, and 1σ [rad] of its
     direction; None where there is none."""
-    stops = runs(rest[:row])
+    stops = find_runs(rest[:row])
     if not stops:
         return None
     first, last = stops[-1]

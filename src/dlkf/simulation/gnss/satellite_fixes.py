@@ -10,6 +10,7 @@ import pandas as pd
 import torch
 from numpy.typing import NDArray
 
+from dlkf.data.readers.units import WEEK_S
 from dlkf.data.schema import STD
 from dlkf.navigation.earth import ecef_from_geodetic, ned_axes
 from dlkf.navigation.geodetic import geodetic_from_ecef
@@ -23,7 +24,6 @@ from dlkf.simulation.motion.vehicle import Truth
 from dlkf.simulation.tables import fix_columns
 
 Array = NDArray[np.floating]
-WEEK = 604800  # s
 FOR_FIX = 5  # satellites that resolve carrier ambiguities
 
 
@@ -100,7 +100,7 @@ def observe_satellites(
     almanac = read_almanac(receiver.almanac)
     rows = len(truth.t)
     dt = float(truth.t[1] - truth.t[0]) if rows > 1 else 1.0
-    start = float(rng.integers(WEEK))
+    start = float(rng.integers(WEEK_S))
     offset_n, v_n = antenna_states(truth, rate_b, config.lever_arm_b)
     lat, lon, height = (torch.from_numpy(x) for x in shift_positions(truth, offset_n))
     r_e = ecef_from_geodetic(lat, lon, height).numpy()
@@ -156,8 +156,8 @@ def _raw(t: Array, start: float, almanac: Almanac, seen: Signals, observed: Obse
     return pd.DataFrame(
         {
             "t": t[row],
-            "gps_week": almanac.week + (tow // WEEK).astype(np.int64)[row],
-            "tow": (tow % WEEK)[row],
+            "gps_week": almanac.week + (tow // WEEK_S).astype(np.int64)[row],
+            "tow": (tow % WEEK_S)[row],
             "prn": almanac.prn[column],
             "pseudorange_m": observed.pseudorange[row, column] - LIGHT * sat_clock,
             "pseudorange_rate": rate,

@@ -53,7 +53,7 @@ class ChassisConfig(Ranged, where="chassis"):
     is the RMS by which it pitches besides, over the swells of a road, in waves of 50 to 500 m.
     ``body_hz``, ``body_damping``: sprung mass on its springs; ``wheel_hz``, ``wheel_damping``: unsprung mass on its
     tyres; ``wheelbase``, ``track`` [m].
-    ``roughness``: ISO 8608 G_d(0.1/m) [m³] (classes A to E: 16, 64, 256, 1024, 4096 · 1e-6), which changes by stretches
+    ``roughness``: ISO 8608 G_d(0.1/m) [m³] (classes A to E: 16, 64, 256, 1024, 4096 · 1e-6), which changes by sections
     of ``roughness_length`` [m] on average (exponential) by a log-normal factor of the amplitude, log-std
     ``roughness_spread`` (0.7 is one class). ``vibration`` [m/s²] and ``vibration_rate`` [rad/s]: RMS per axis at
     15 m/s of tones that follow the speed; ``shaking``: what does not depend on it.
@@ -142,8 +142,8 @@ def apply_mounting(rng: np.random.Generator, car: Car, route: Route, axle: Truth
     motion = route.motion(axle.t)
     slope, slope_rate = route.slope.at(motion)
     slip, slip_rate = slip_angle(car, route, motion)
-    stretches = draw_stretches(stretch_rng, car.kind, float(np.ptp(motion.distance)), float(motion.speed.max()))
-    suspended = suspension(ride_rng, car, route, float(axle.t[-1]), stretches)
+    sections = draw_road_sections(stretch_rng, car.kind, float(np.ptp(motion.distance)), float(motion.speed.max()))
+    suspended = suspension(ride_rng, car, route, float(axle.t[-1]), sections)
     roll, pitch, heave = suspended(axle.t).T
     roll_rate, pitch_rate, heave_rate = suspended(axle.t, nu=1).T
     shake, shake_rate = vibration(tone_rng, car.kind, motion)
@@ -158,7 +158,7 @@ def apply_mounting(rng: np.random.Generator, car: Car, route: Route, axle: Truth
     mount = None
     if not car.kind.shaking.is_still:
         mount = shake_mount(
-            shaking_rng, car.kind.shaking, route.motion, axle.t, lambda t: stretches.at(route.motion(t).distance),
+            shaking_rng, car.kind.shaking, route.motion, axle.t, lambda t: sections.at(route.motion(t).distance),
             lambda t: loads(route, route.motion(t)),
         )  # fmt: skip
         moved += mount.moved
@@ -176,8 +176,8 @@ def apply_mounting(rng: np.random.Generator, car: Car, route: Route, axle: Truth
 
 
 @dataclass(frozen=True)
-class Stretches:
-    """The roughness of a road relative to its mean (amplitude), by stretches that end at ``ends`` [m]."""
+class RoadSections:
+    """The roughness of a road relative to its mean (amplitude), by sections that end at ``ends`` [m]."""
 
     ends: Array
     factors: Array
@@ -187,19 +187,19 @@ class Stretches:
         return self.factors[np.minimum(np.searchsorted(self.ends, distance, side="right"), len(self.factors) - 1)]
 
 
-def draw_stretches(rng: np.random.Generator, kind: ChassisConfig, length: float, fastest: float) -> Stretches:
-    """Stretches of a road as long as that [m]; a single one where the kind has no spread.
+def draw_road_sections(rng: np.random.Generator, kind: ChassisConfig, length: float, fastest: float) -> RoadSections:
+    """RoadSections of a road as long as that [m]; a single one where the kind has no spread.
 
     None is rougher than a driver would take at the ``fastest`` [m/s] of the drive: the body's acceleration goes with
     √(G_d v), and ``ROUGHEST`` is an average road (64e-6) at 180 m/s, or a poor one (1024e-6) at 11 m/s.
     """
     if kind.roughness_spread == 0:
-        return Stretches(np.array((math.inf,)), np.ones(1))
+        return RoadSections(np.array((math.inf,)), np.ones(1))
     mean = length / kind.roughness_length
     count = 2 + int(mean + 10 * math.sqrt(mean))  # ten sigma more than it takes
     ends = np.cumsum(kind.roughness_length * rng.standard_exponential(count))
     most = math.sqrt(ROUGHEST / max(kind.roughness * max(fastest, 1.0), 1e-12))
-    return Stretches(ends, np.minimum(np.exp(kind.roughness_spread * rng.standard_normal(count)), most))
+    return RoadSections(ends, np.minimum(np.exp(kind.roughness_spread * rng.standard_normal(count)), most))
 
 
 def loads(route: Route, motion: Kinematics) -> tuple[Array, Array]:
@@ -209,7 +209,7 @@ def loads(route: Route, motion: Kinematics) -> tuple[Array, Array]:
 
 
 def suspension(
-    rng: np.random.Generator, car: Car, route: Route, end: float, stretches: Stretches | None
+    rng: np.random.Generator, car: Car, route: Route, end: float, sections: RoadSections | None
 ) -> scipy.interpolate.BSpline:
     """Roll, pitch [rad] and heave [m, up] of the body against the road, until ``end`` [s], as a spline.
 
@@ -223,14 +223,14 @@ def suspension(
     kind = car.kind
     body = _filter(resonance(kind.body_hz, kind.body_damping, NODE_HZ), load)
     if kind.roughness > 0:
-        road = rough_road(rng, kind, motion.distance, stretches)
+        road = rough_road(rng, kind, motion.distance, sections)
         wheels = _filter(resonance(kind.wheel_hz, kind.wheel_damping, NODE_HZ), road)
         body += _filter(resonance(kind.body_hz, kind.body_damping, NODE_HZ, at_base=True), wheels)
     return scipy.interpolate.make_interp_spline(nodes, body, k=5)
 
 
 def rough_road(
-    rng: np.random.Generator, kind: ChassisConfig, distance: Array, stretches: Stretches | None = None
+    rng: np.random.Generator, kind: ChassisConfig, distance: Array, sections: RoadSections | None = None
 ) -> Array:
     """Roll, pitch [rad] and height [m] of the road under four wheels at distances (N,) → (N, 3) (ISO 8608).
 
@@ -242,8 +242,8 @@ def rough_road(
     count = int((distance.max() + 2 * kind.wheelbase) / PROFILE_STEP) + 3
     steepness = math.sqrt((0.2 * math.pi) ** 2 * kind.roughness / (2 * PROFILE_STEP))
     white = steepness * PROFILE_STEP * rng.standard_normal((2, count))
-    if stretches is not None and len(stretches.factors) > 1:
-        white *= stretches.at(PROFILE_STEP * np.arange(count))
+    if sections is not None and len(sections.factors) > 1:
+        white *= sections.at(PROFILE_STEP * np.arange(count))
     along, across = (
         scipy.signal.lfilter([1.0], [1.0, -math.exp(-2 * math.pi * wave * PROFILE_STEP)], x)
         for wave, x in zip((FULL_WAVE, ROLL_WAVE), white)

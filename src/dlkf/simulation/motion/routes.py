@@ -105,11 +105,6 @@ class VehicleConfig(Ranged, where="vehicle"):
                 f"{self.min_radius} m radius with {self.min_lateral} m/s² lateral takes {slowest:.1f} km/h"
             )
 
-    @property
-    def is_banked(self) -> bool:
-        """Whether the road has a cross slope anywhere."""
-        return self.bank_std > 0 or self.superelevation > 0
-
 
 @dataclass(frozen=True)
 class Plan:

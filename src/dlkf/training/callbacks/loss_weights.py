@@ -14,27 +14,22 @@ from dlkf.training.loss import TERMS, unit_weights
 if TYPE_CHECKING:
     from dlkf.training.module import FilterTraining
 
-RULES = ("pilot", "ratio", "normalised")
-
 
 class AdaptiveLossWeights(Callback):
     """Weights of an epoch from the unweighted losses L̄ of those before, moving averages with ``memory``.
 
-    ``pilot`` (R065, R066): the first ``pilot_epochs`` run unweighted and show what the losses of velocity and attitude,
-    L₀; from then on w_v = L̄_p / L₀_v and w_h = L̄_p / L₀_h, w_p = 1. They are large while the position loss is, and
-    fall as the filter converges. ``ratio``: w_v = L̄_p / L̄_v, which keeps the three losses equal.
-    ``normalised``: w = 1 / L̄ for each (the alternative of R067). Every weight stays within 1/``w_max`` … ``w_max``.
+    The first ``pilot_epochs`` run unweighted and show what the losses of velocity and attitude, L₀ (R065, R066); from
+    then on w_v = L̄_p / L₀_v and w_h = L̄_p / L₀_h, w_p = 1. They are large while the position loss is, and fall as the
+    filter converges. Every weight stays within 1/``w_max`` … ``w_max``.
     """
 
-    def __init__(self, rule: str = "pilot", pilot_epochs: int = 1, w_max: float = 10.0, memory: float = 0.8) -> None:
+    def __init__(self, pilot_epochs: int = 1, w_max: float = 10.0, memory: float = 0.8) -> None:
         if w_max < 1 or not 0 <= memory < 1 or pilot_epochs < 1:
             raise InputError(
                 "callbacks.loss_weights: w_max ≥ 1, 0 ≤ memory < 1 and pilot_epochs ≥ 1, got "
                 f"{w_max}, {memory}, {pilot_epochs}"
             )
-        if rule not in RULES:
-            raise InputError(f"callbacks.loss_weights: rule is {rule!r}; choose one of {', '.join(RULES)}")
-        self.rule, self.pilot_epochs, self.w_max, self.memory = rule, pilot_epochs, w_max, memory
+        self.pilot_epochs, self.w_max, self.memory = pilot_epochs, w_max, memory
         self.average: dict[str, float] = {}
         self.pilot: dict[str, float] = {}
         self.epochs = 0
@@ -54,10 +49,8 @@ class AdaptiveLossWeights(Callback):
         """Weights in force; 1 while the pilot lasts."""
         if not self.pilot:
             return unit_weights()
-        if self.rule == "normalised":
-            return {t: self._bound(1.0, self.average.get(t)) for t in TERMS}
-        position, against = self.average.get("position"), self.pilot if self.rule == "pilot" else self.average
-        others = {t: self._bound(position, against.get(t)) for t in TERMS if t != "position"}
+        position = self.average.get("position")
+        others = {t: self._bound(position, self.pilot.get(t)) for t in TERMS if t != "position"}
         return {"position": 1.0} | others
 
     def _bound(self, above: float | None, below: float | None) -> float:

@@ -106,7 +106,9 @@ def _read(reader: Any, path: Path, kind: str, table: str | None) -> LogTable:
         raise InputError(f"{path}: {chosen[0].topic} is {chosen[0].msgtype}; must be {', '.join(every)}")
     messages = ((stamp, reader.deserialize(raw, c.msgtype)) for c, stamp, raw in reader.messages(connections=chosen))
     if name == SENTENCE:
-        return LogTable(_sentences(messages, f"{path}, {chosen[0].topic}"), path, "message")
+        sentences = nmea.sentences("\n".join(m.sentence.strip() for _, m in messages).encode())
+        fixes = nmea.fixes(sentences, f"{path}, {chosen[0].topic}")
+        return LogTable(fixes.rename(columns={"utc_ns": "t_ns"}), path, "message")
     rows = []
     for stamp, message in messages:
         header = getattr(message, "header", None)
@@ -173,12 +175,6 @@ def _nav_pvt(m: Any) -> Row:
         date = np.datetime64(f"{year:04d}-{month:02d}-{day:02d}T{hour:02d}:{minute:02d}", "ns").astype(np.int64)
         row["utc_ns"] = int(date) + second * 10**9 + int(field["nano"])
     return row | dict(zip(STD, (h, h, v, s, s, s)))
-
-
-def _sentences(messages: Iterator[tuple[int, Any]], where: str) -> pd.DataFrame:
-    """nmea_msgs/Sentence: fixes with the UTC of the sentences themselves as ``t_ns``."""
-    content = "\n".join(m.sentence.strip() for _, m in messages).encode()
-    return nmea.fixes(nmea.sentences(content), where).rename(columns={"utc_ns": "t_ns"})
 
 
 def _shorten_type(msgtype: str) -> str:

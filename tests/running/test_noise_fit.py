@@ -21,8 +21,8 @@ from dlkf.filters.aids.attach import find_tables
 from dlkf.filters.tuning import Tuning
 from dlkf.navigation.imu_errors import imu_spec
 from dlkf.onboard.compiled_filter import compile_or_keep
-from dlkf.running import likelihood
-from dlkf.running.likelihood import Evidence, FixOffset, NoiseFit, find_noise, generic_filter, search_fix_offset
+from dlkf.running import noise_fit
+from dlkf.running.noise_fit import Evidence, FixOffset, NoiseFit, find_noise, generic_filter, search_fix_offset
 from dlkf.running.start import align
 from tests.cars import IMU, car_batch, write_segments
 
@@ -51,21 +51,21 @@ def evidence_in_c(drives) -> Evidence:
 
 def test_the_density_is_that_of_student(drives):
     z, S = torch.tensor([[0.3, -1.0]]).double(), torch.tensor([[[2.0, 0.3], [0.3, 0.5]]]).double()
-    t = torch.distributions.StudentT(likelihood.FREEDOM)
-    one = likelihood._density(z[:, :1], S[:, :1, :1], torch.tensor([1]))
+    t = torch.distributions.StudentT(noise_fit.FREEDOM)
+    one = noise_fit._density(z[:, :1], S[:, :1, :1], torch.tensor([1]))
     scaled = -t.log_prob(z[:, 0] / S[:, 0, 0].sqrt()) + 0.5 * S[:, 0, 0].log()
-    zero = likelihood._density(torch.zeros(1, 1).double(), torch.ones(1, 1, 1).double(), torch.tensor([1]))
+    zero = noise_fit._density(torch.zeros(1, 1).double(), torch.ones(1, 1, 1).double(), torch.tensor([1]))
     assert one - zero == pytest.approx(float(scaled + t.log_prob(torch.tensor(0.0))))
-    assert likelihood._density(z, S, torch.tensor([2])).shape == (1,)
+    assert noise_fit._density(z, S, torch.tensor([2])).shape == (1,)
 
 
 def test_gaps_are_withheld_and_scored(drives):
     evidence = Evidence.of(drives)
-    B = len(drives) * (1 + len(likelihood.GAPS_S))
+    B = len(drives) * (1 + len(noise_fit.GAPS_S))
     assert evidence.batch.size[0] == B
-    whole = evidence.batch.available[:: 1 + len(likelihood.GAPS_S)]
+    whole = evidence.batch.available[:: 1 + len(noise_fit.GAPS_S)]
     assert whole.all() and not evidence.batch.available[1].all()
-    assert not evidence.offered[:, : int(likelihood.SETTLE_S)].any()
+    assert not evidence.offered[:, : int(noise_fit.SETTLE_S)].any()
     start = whole_drives([drives[0]], [align(drives[0])])
     assert torch.equal(evidence.batch.imu[0, : start.size[1]], start.imu[0])
 
@@ -106,7 +106,7 @@ def test_fixes_that_are_late_are_found_out(drives):
 @pytest.fixture
 def coarse(monkeypatch):
     """A search in one step size, for what comes behind it."""
-    monkeypatch.setattr(likelihood, "STEPS", (4.0,))
+    monkeypatch.setattr(noise_fit, "STEPS", (4.0,))
 
 
 @pytest.mark.parametrize(("delay_s", "arm_m", "near"), [
@@ -181,7 +181,7 @@ def test_noise_is_found_with_the_sensors_that_a_drive_has(drives, monkeypatch):
         names.append(name)
         return NoiseFit(imu, tuning, FixOffset(), FixOffset(), 0.0, 0.0)
 
-    monkeypatch.setattr(likelihood, "find_noise", found)
+    monkeypatch.setattr(noise_fit, "find_noise", found)
     for name, tables in (("mbkf21_car", ["speed"]), ("mbkf21_car", []), ("mbkf15", ["speed"])):
         estimator, _, _ = generic_filter(drives, name, IMU, Tuning(), ALIGN, [STANDARD[t] for t in tables])
         assert [t.name for t in find_tables(estimator)] == (tables if "car" in name else [])

@@ -30,7 +30,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import pad
 
-from dlkf.base.console import ProgressCallback
+from dlkf.base.console import ProgressCallback, no_progress
 from dlkf.base.errors import InputError
 from dlkf.data.aid_tables import AidTable
 from dlkf.data.alignment import ALIGN, AlignConfig
@@ -230,7 +230,7 @@ def find_noise(
     *,
     delay: bool = True,
     called: str = "found",
-    progress: ProgressCallback | None = None,
+    progress: ProgressCallback = no_progress,
     compiler: Compiler | None = None,
 ) -> NoiseFit:
     """The noise under which the fixes are most likely, for the Kalman filter of this name.
@@ -258,8 +258,7 @@ def find_noise(
     def score(values: Mapping[str, float], placing: FixOffset) -> float:
         nonlocal done
         done += 1
-        if progress is not None:
-            progress(done, None)  # how many it takes is known at the end alone
+        progress(done, None)  # how many it takes is known at the end alone
         if any(values[k] > limit for k, limit in LARGEST.items()) or not 0 <= placing.delay_s <= LONGEST_DELAY_S:
             return math.inf
         place = (*(round(math.log(v), 9) for v in values.values()), *(round(x, 9) for x in placing))
