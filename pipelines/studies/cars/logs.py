@@ -6,6 +6,7 @@ too. None of the data may enter the project.
 
 from __future__ import annotations
 
+import struct
 import subprocess
 import zipfile
 from collections.abc import Callable, Iterator, Sequence
@@ -306,6 +307,44 @@ def read_kth(logs: Path) -> Iterator[DriveFrames]:
     yield DriveFrames({"drive": "kth", "group": "kth"}, table, fixes, reference_table(fixes))
 
 
+def read_boulder(logs: Path, ahead_s: float = 0.185) -> Iterator[DriveFrames]:
+    """A roof with an IMU (Back-Right-Up) at 100 Hz and RTK with velocities at 4 Hz, stamped as they came in: the time
+    tags of RTKLIB give the beginning and the end of the IMU's file."""
+    folder = logs / "rtklibexplorer/GNSS_IMU/data/drive_0708"
+    tag = (folder / "imu_1934.csv.tag").read_bytes()
+    (seconds, fraction), tags = (
+        struct.unpack("<Id", tag[64:76]),
+        np.frombuffer(tag[76 : 8 * (len(tag) // 8) - 4], "<u4"),
+    )
+    rows = np.genfromtxt(folder / "imu_1934.csv", delimiter=",", skip_header=1, skip_footer=1)
+    clock = rows[:, 6] - rows[0, 6]
+    t = seconds % 86400 + fraction + clock * (1e-3 * tags[-2] / clock[-1])
+    imu = turn_level(level(imu_table(t, G * rows[:, :3], np.radians(rows[:, 3:6]), BRU)), np.radians(5.5))
+    gnss = pd.read_csv(folder / "gnss_1934_sf.pos", sep=r"\s+", skiprows=1, header=None)
+    t_fix = pd.to_timedelta(gnss[1]).dt.total_seconds().to_numpy() + ahead_s
+    columns = {"std_pos": (7, 8, 9), "vel": (15, 16, 17), "std_vel": (18, 19, 20)}
+    known = {f"{kind}_{axis}": gnss[k].to_numpy() for kind, places in columns.items() for axis, k in zip("ned", places)}
+    quality = gnss[5].astype(int).map({1: 4, 2: 5, 4: 2, 5: 1}).to_numpy()
+    fixes = fix_table(t_fix, gnss[[2, 3, 4]].to_numpy(), quality, **known | {"vel_d": -known["vel_d"]})
+    meta = {"drive": "boulder", "lever_arm_x_m": 0.0, "lever_arm_y_m": -0.05, "lever_arm_z_m": 0.0}
+    yield DriveFrames(meta, imu, fixes, reference_table(fixes, every_s=0.25))
+
+
+def read_raut(logs: Path, until_s: float = 235.0) -> Iterator[DriveFrames]:
+    """Four minutes with a VN-100, of whose samples a sixth is missing, and a USB receiver without heights; later its
+    positions are useless."""
+    folder = logs / "AkshajRaut/Sensor-Fusion-of-GPS-and-IMU/analysis"
+    imu, gnss = (pd.read_csv(folder / f"trip_{name}.csv") for name in ("imu", "gps"))
+    zero = imu["seconds"].iloc[0]
+    t, t_fix = ((x["seconds"] - zero + 1e-9 * x["nanoseconds"]).to_numpy() for x in (imu, gnss))
+    f, w = (imu[[f"{kind}.{axis}" for axis in "xyz"]].to_numpy() for kind in ("Linear", "Angular"))
+    llh = np.stack([gnss["Latitude"], gnss["Longitude"], 0 * t_fix], -1)
+    fixes = _puck_fixes(t_fix - 0.04, llh, np.full(len(t_fix), 1.5))
+    table = turn_level(level(imu_table(t, f, w, FRD)), np.radians(-4.8))
+    some, seen = (x[x["t"] < until_s].reset_index(drop=True) for x in (table, fixes))
+    yield DriveFrames({"drive": "raut"}, some, seen, reference_table(seen))
+
+
 @dataclass(frozen=True)
 class Log:
     """Where a log is, how it is read, and the seconds between its outages."""
@@ -324,4 +363,6 @@ LOGS = {
     "boston": Log(("freecode23/EECE5554", "MakiseYuki/EECE5554_Robotic-and-Navigation"), read_boston, 20),
     "beijing": Log(("yandld/nav_matlab",), read_beijing, 20),
     "kth": Log(("yandld/nav_matlab",), read_kth),
+    "boulder": Log(("rtklibexplorer/GNSS_IMU",), read_boulder),
+    "raut": Log(("AkshajRaut/Sensor-Fusion-of-GPS-and-IMU",), read_raut),
 }
