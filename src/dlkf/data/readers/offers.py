@@ -57,11 +57,13 @@ class Offer:
 
 @dataclass(frozen=True)
 class Contents:
-    """What a file gives; ``held`` describes its content, for a line that refuses it."""
+    """What a file gives; ``held`` describes its content, for a line that refuses it, ``lost`` a table in it with
+    positions of which no fixes can be made."""
 
     path: Path
     offers: list[Offer] = field(default_factory=list)
     held: str = ""
+    lost: str = ""
 
 
 def recognise_file(path: Path, known: Known = MappingProxyType({})) -> Contents:
@@ -96,7 +98,7 @@ def recognise_file(path: Path, known: Known = MappingProxyType({})) -> Contents:
     found = _offer_table(path, name, table, options, None, known)
     if not found:
         return Contents(path, held=recognise.describe_missing(table))
-    return Contents(path, found, _describe_lone_sensor(table, found[0]))
+    return Contents(path, found, _describe_lone_sensor(table, found[0]), _describe_lost_fixes(table, found))
 
 
 def matches(path: Path, file: Any) -> bool:
@@ -111,6 +113,15 @@ def _describe_lone_sensor(table: LogTable, offer: Offer) -> str:
     if len(alone) != 1 or "imu" in offer.specs:
         return ""
     return f"{offer.detail}, without {recognise.COUNTERPARTS[alone.pop()]}"
+
+
+def _describe_lost_fixes(table: LogTable, offers: list[Offer]) -> str:
+    """What a table with a latitude has and lacks, where none of its offers has fixes; else empty."""
+    frame = recognise.convert_numbers(table).frame
+    names = [str(name) for name in frame.select_dtypes("number")]
+    if vocabulary.find_column(names, "lat") is None or any("gnss" in offer.specs for offer in offers):
+        return ""
+    return recognise.describe_missing(table)
 
 
 def _offer_preset(path: Path, name: str) -> Contents:
@@ -147,14 +158,15 @@ def _offer_matlab(path: Path, known: Known) -> Contents:
         return Contents(path, held=str(error).removeprefix(f"{path}: "))
     if all(mark in tables.get(kind, ()) for kind, mark in NAVEGO.items()):
         return _offer_preset(path, "navego")
-    found = [
-        offer
-        for name, frame in tables.items()
-        for offer in _offer_table(path, "matlab", LogTable(frame, path), {}, name, known)
-    ]
+    by_table = {
+        name: _offer_table(path, "matlab", LogTable(frame, path), {}, name, known) for name, frame in tables.items()
+    }
+    lost = {name: _describe_lost_fixes(LogTable(tables[name], path), offers) for name, offers in by_table.items()}
+    found = [offer for offers in by_table.values() for offer in offers]
     first = list(tables.items())[:4]
     said = "; ".join(f"{name}: {recognise.describe_missing(LogTable(frame, path))}" for name, frame in first)
-    return Contents(path, found, said or "no matrix and no structure of vectors")
+    why = next((f"{name}: {text}" for name, text in lost.items() if text), "")
+    return Contents(path, found, said or "no matrix and no structure of vectors", why)
 
 
 def _offer_table(
