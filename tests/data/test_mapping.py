@@ -266,7 +266,7 @@ def test_no_position_yet(tmp_path, tables):
 MISTAKES = {
     "unknown key": ({"imu__accel__unti": "g"}, "reader.imu.accel: unknown key unti; did you mean unit? known"),
     "unknown format": ({"gnss__format": "gpx"}, "reader.gnss.format=gpx: unknown; known are csv"),
-    "rows": ({"imu__rows": "some"}, "reader.imu.rows is 'some', must be filled, changed or"),
+    "rows": ({"imu__rows": "some"}, "reader.imu.rows is 'some', must be filled, changed, once or"),
     "no row left": ({"imu__rows": {"column": "t", "is": ["x"]}}, "no row is left"),
     "pattern": ({"imu__lines": "("}, "is no regular expression"),
     "a name for columns": ({"imu__accel__columns": "accel_x"}, "has a single name, must have 3"),

@@ -167,7 +167,11 @@ def check_time(t: np.ndarray, where: str, kind: str = "imu", name_row: Callable[
         k = int(back[0])
         if (same := int((np.diff(t) == 0).sum())) > MOST_SAME * len(t):
             rounding = _describe_rounding(t)
-            remedy = rounding if kind == "imu" else f"remove duplicate rows; if there are none, {rounding}"
+            remedy = (
+                rounding
+                if kind == "imu"
+                else f"remove duplicate rows (reader.{kind}.rows=once); if there are none, {rounding}"
+            )
             raise InputError(
                 f"{where}: {same} of {len(t)} rows have the stamp of the row before: {remedy} "
                 f"(reader.{kind}.time.respace=true spreads such rows evenly)"

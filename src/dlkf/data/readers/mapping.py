@@ -263,12 +263,13 @@ class Mapped:
 
 def select_rows(mapped: Mapped) -> Mapped:
     """The rows that ``rows`` chooses: ``{column: …, is: [...]}``; ``filled``: those whose columns are not empty;
-    ``changed``: of these, those whose position is not that of the row before."""
+    ``changed``: of these, those whose position is not that of the row before; ``once``: those that do not have
+    the stamp and all columns of the row before."""
     rows = mapped.spec.get("rows")
     where = f"reader.{mapped.kind}.rows"
     if rows is None:
         return mapped
-    if rows in ("filled", "changed"):
+    if rows in ("filled", "changed", "once"):
         entries = ("accel", "gyro", "position", "pressure", "height")
         names = {str(n) for key in entries for n in _names(mapped, key)}
         time = mapped.time.get("column")
@@ -281,11 +282,14 @@ def select_rows(mapped: Mapped) -> Mapped:
         if rows == "changed":
             place = frame.loc[keep, [c for c in frame.columns if c in {str(n) for n in _names(mapped, "position")}]]
             keep[keep] = (place != place.shift()).any(axis=1).to_numpy()
+        elif rows == "once":
+            cells = frame.loc[keep, [c for c in frame.columns if c in names or c in some]]
+            keep[keep] = (cells != cells.shift()).any(axis=1).to_numpy()
     elif isinstance(rows, Mapping) and set(rows) == {"column", "is"}:
         values = rows["is"] if isinstance(rows["is"], (list, tuple)) else [rows["is"]]
         keep = mapped.texts(rows["column"]).isin([str(v) for v in values]).to_numpy()
     else:
-        raise InputError(f"{where} is {rows!r}, must be filled, changed or {{column: …, is: [...]}}")
+        raise InputError(f"{where} is {rows!r}, must be filled, changed, once or {{column: …, is: [...]}}")
     if not keep.any():
         raise InputError(f"{mapped.table.path}: no row is left by {where}={rows}; set it right")
     return mapped.rows(keep)

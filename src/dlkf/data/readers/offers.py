@@ -174,10 +174,11 @@ def _offer_table(
 ) -> list[Offer]:
     table = recognise.convert_numbers(table)
     named = {kind: recognise.named_columns(table, spec) for kind, spec in known.items()}
-    imu, gnss = recognise.imu_spec(table, named.get("imu", {})), None
+    times = {kind: spec.get("time") or {} for kind, spec in known.items()}
+    imu, gnss = recognise.imu_spec(table, named.get("imu", {}), times.get("imu", {})), None
     place = named.get("gnss", {})
     if imu is None or "position" in place or vocabulary.find_column(map(str, table.frame.columns), "lat"):
-        gnss = recognise.gnss_spec(table, place)
+        gnss = recognise.gnss_spec(table, place, times.get("gnss", {}))
     source: dict[str, Any] = {"format": name, "file": path.name, "text": options}
     source |= {"table": part} if part is not None else {}
     time = next((one.spec["time"] for one in (imu, gnss) if one is not None), None)

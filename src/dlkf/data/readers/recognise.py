@@ -49,14 +49,16 @@ def named_columns(table: LogTable, known: Mapping[str, Any]) -> dict[str, list[s
     return {key: [str(c) for c in columns] for key, columns in entries.items() if {*map(str, columns)} <= {*names}}
 
 
-def imu_spec(table: LogTable, named: Mapping[str, list[str]] = NONE_NAMED) -> Recognised | None:
+def imu_spec(
+    table: LogTable, named: Mapping[str, list[str]] = NONE_NAMED, named_time: Mapping[str, Any] = stamps.NONE_NAMED
+) -> Recognised | None:
     """The mapping of a table that holds an IMU, in the columns that are ``named`` by entry (:func:`named_columns`) or
-    known by their names or numbers; None if it does not."""
+    known by their names or numbers, at the stamps of the settings ``named_time``; None if it does not."""
     frame, names = _select_numeric(table)
     triads = vocabulary.find_triads(names) | {key: named[key] for key in vocabulary.SENSORS if key in named}
     if len(triads) == 2:
         known = frame[triads["accel"] + triads["gyro"]].notna().all(axis=1)
-        time = stamps.time_spec(table, known, SLOWEST_IMU_S, FASTEST_IMU_S)
+        time = stamps.time_spec(table, known, SLOWEST_IMU_S, FASTEST_IMU_S, named_time)
         if time is None:
             return None
         sensors = {key: {"columns": columns} for key, columns in triads.items()}
@@ -109,8 +111,11 @@ def sensor_spec(table: LogTable, called: str) -> dict[str, Spec]:
     return {}
 
 
-def gnss_spec(table: LogTable, named: Mapping[str, list[str]] = NONE_NAMED) -> Recognised | None:
-    """The mapping of a table that holds fixes, in the columns ``named`` as an IMU's; None if it does not."""
+def gnss_spec(
+    table: LogTable, named: Mapping[str, list[str]] = NONE_NAMED, named_time: Mapping[str, Any] = stamps.NONE_NAMED
+) -> Recognised | None:
+    """The mapping of a table that holds fixes, in the columns and at the stamps that are named as an IMU's; None if it
+    does not."""
     frame, names = _select_numeric(table)
     receiver = choose_receiver(frame, [str(n) for n in table.frame.columns], named.get("position", ()))
     found = receiver.found
@@ -126,10 +131,9 @@ def gnss_spec(table: LogTable, named: Mapping[str, list[str]] = NONE_NAMED) -> R
         note = f"took {columns} for latitude, longitude, height{more}"
         return Recognised(spec, () if _are_unnamed(names) else (note,))
     known = frame[[lat, lon]].notna().all(axis=1)
-    held = _find_repeated(frame[known], [lat, lon])
-    if held is not None:
-        known[known] = ~held
-    time = stamps.time_spec(table, known, SLOWEST_FIX_S, FASTEST_FIX_S)
+    rows, held = _find_repeated(table.frame[known], [lat, lon], stamps.find_named(frame, named_time))
+    known[known] = ~held
+    time = stamps.time_spec(table, known, SLOWEST_FIX_S, FASTEST_FIX_S, named_time)
     if time is None or height is None:
         return None
     position: Spec = {"columns": [lat, lon, height], "unit": _angle_unit(frame, found)}
@@ -159,9 +163,10 @@ def gnss_spec(table: LogTable, named: Mapping[str, list[str]] = NONE_NAMED) -> R
         spec, note = _dilutions(table.frame[known], found, quality)
         out |= spec
         notes.append(note)
-    if held is not None:
-        out["rows"] = "changed"
-        notes.append(f"took {int(known.sum())} of {len(held)} rows for fixes: the others repeat the position before")
+    if rows is not None:
+        out["rows"] = rows
+        what = {"changed": "position", "once": "stamp and position"}[rows]
+        notes.append(f"took {int(known.sum())} of {len(held)} rows for fixes: the others repeat the {what} before")
     return Recognised(out, (*more, *notes), receiver.refusal)
 
 
@@ -185,13 +190,18 @@ def _hemispheres(frame: pd.DataFrame) -> list[str] | None:
     return [side for side in sides if side is not None] if all(sides) and len(frame) else None
 
 
-def _find_repeated(frame: pd.DataFrame, place: list[str]) -> pd.Series | None:
-    """Rows that repeat the position before, in a table of IMU samples beside which most do; else None."""
+def _find_repeated(frame: pd.DataFrame, place: list[str], clock: list[str]) -> tuple[str | None, pd.Series]:
+    """Rows that repeat the fix before, and the setting ``rows`` that leaves them out, None where there are none: in a
+    table of fixes those with its stamp too, of the columns ``clock`` or by name; beside samples of an IMU most rows."""
     names = [str(c) for c in frame.columns]
-    if len(frame) < 10 or not vocabulary.find_triads(names):
-        return None
     same = (frame[place] == frame[place].shift()).all(axis=1)
-    return same if same.mean() > 0.5 else None
+    if vocabulary.find_triads(names):
+        most = len(frame) >= 10 and same.mean() > 0.5
+        return ("changed", same) if most else (None, same & False)
+    if times := clock or vocabulary.match_columns(names, vocabulary.TIME):
+        same &= (frame[times] == frame[times].shift()).all(axis=1)
+        return ("once" if same.any() else None), same
+    return None, same & False
 
 
 def aid_specs(table: LogTable, called: str, time: Spec | None = None, taken: Collection[str] = ()) -> dict[str, Spec]:

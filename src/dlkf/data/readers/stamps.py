@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -15,6 +17,7 @@ from dlkf.data.readers.frames import LogTable
 from dlkf.data.readers.mapping import TABULAR, Mapped
 
 Spec = dict[str, Any]
+NONE_NAMED: Mapping[str, Any] = MappingProxyType({})
 CALENDAR = r"^\s*(\d{4}[-/.]\d{1,2}[-/.]\d{1,2}|\d{1,2}-[A-Za-z]{3}-\d{4}|\d{1,2}[-/.]\d{1,2}[-/.]\d{4}"
 CALENDAR += r"|\d{1,2}[/.]\d{1,2}[/.]\d{2}|\d{8})"
 CALENDAR += r"[T ]+\d{1,2}:\d{2}"
@@ -29,13 +32,20 @@ CLOCK_NAMES = {"gps": "GPS time", None: "of an unnamed clock"}  # of calendar te
 OLDEST_UNIX = 1.0e9  # s: 2001; no log of a car with an IMU of this kind is older
 
 
-def time_spec(table: LogTable, rows: pd.Series, slowest: float, fastest: float) -> Spec | None:
-    """The mapping's ``time`` for the rows of one kind, between which ``fastest`` to ``slowest`` seconds pass."""
+def time_spec(
+    table: LogTable, rows: pd.Series, slowest: float, fastest: float, named: Mapping[str, Any] = NONE_NAMED
+) -> Spec | None:
+    """The mapping's ``time`` for the rows of one kind, between which ``fastest`` to ``slowest`` seconds pass; of the
+    settings ``named`` by the user the column and the unit count."""
     frame = table.frame[rows]
     if frame.empty:
         return None
+    chosen = find_named(frame, named)
+    if chosen and named.get("unit") is not None:
+        return {"column": named["column"], "unit": named["unit"]}
+    frame = frame[chosen] if chosen else frame
     names = [str(c) for c in frame.columns]
-    called = vocabulary.match_columns(names, vocabulary.TIME)
+    called = chosen or vocabulary.match_columns(names, vocabulary.TIME)
     if (dated := _find_dates(frame, called, vocabulary.match_columns(names, vocabulary.DATE))) is not None:
         return dated
     dates = [name for name in vocabulary.match_columns(names, vocabulary.DATE) if _counts_days(frame[name], slowest)]
@@ -62,6 +72,13 @@ def time_spec(table: LogTable, rows: pd.Series, slowest: float, fastest: float) 
         return spec | {"week": week}
     clock = choose_clock(column, float(np.nanmedian(values)) / units.TIME[unit])
     return spec | ({"clock": clock} if clock else {})
+
+
+def find_named(frame: pd.DataFrame, named: Mapping[str, Any]) -> list[str]:
+    """The columns of the stamps that a user's settings name, where a table has them all; else none."""
+    column = named.get("column")
+    columns = [str(c) for c in (column if isinstance(column, (list, tuple)) else [column]) if c is not None]
+    return columns if {*columns} <= {*map(str, frame.columns)} else []
 
 
 def _is_clock_face(values: np.ndarray, slowest: float) -> bool:

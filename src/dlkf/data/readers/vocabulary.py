@@ -99,7 +99,7 @@ PRESSURE = r"(?:baro(?:meter|metric)? ?)?(?:air ?)?(?:press(?:ure)?|luftdruck|dr
 BARO_HEIGHT = r"baro(?:metric|meter)? ?(?:alt(?:itude)?|height)|relative ?altitude"
 
 TIME = (
-    r"#?(?:t|time|time ?stamp|tow|sow|gps ?(?:time|sow|tow|seconds?|t)?|unix ?(?:time)?|posix(?: ?time)?|utc"
+    r"#?(?:t|time|time ?stamps?|tow|sow|gps ?(?:time|sow|tow|seconds?|t)?|unix ?(?:time)?|posix(?: ?time)?|utc"
     r"|stamp|epoch|secs?|seconds|date ?time|milli(?:s|seconds)?"
     r"|micro(?:s|seconds)?|nano(?:s|seconds)?|ms|us|ns|ticks|sample ?time"
     r"|ros ?time|i ?tow|utc ?(?:time|seconds)|seconds ?elapsed|elapsed|sample ?time ?fine|date ?num"
