@@ -10,6 +10,7 @@ import pytest
 
 from dlkf.base.errors import InputError
 from dlkf.data.readers.auto import AutoReader
+from dlkf.data.schema import ACCEL, GYRO
 from tests.data.logs.clock import UNIX
 from tests.data.test_csv import log_reader
 from tests.data.test_foreign_tables import ENGLISH, Tables, box, fixes, read
@@ -46,3 +47,61 @@ def test_repeated_rows_of_any_reader(tmp_path: Path, drive: Tables) -> None:
     (got,) = log_reader(imu__rows="once", gnss__rows="once").read(tmp_path)
     for kind, table in (("imu", got.imu), ("gnss", got.gnss)):
         pd.testing.assert_frame_equal(table[["t"]], drive[kind][["t"]], check_exact=False, rtol=0, atol=1e-6)
+
+
+def in_two(t: pd.Series, ticks: int) -> tuple[np.ndarray, np.ndarray]:
+    """Whole seconds and the ticks beside them."""
+    return np.divmod(np.round((UNIX + t) * ticks).astype(np.int64), ticks)
+
+
+PARTS = {
+    ("seconds", "nanoseconds"): 10**9,
+    ("header.stamp.secs", "header.stamp.nsecs"): 10**9,
+    ("time_sec", "time_usec"): 10**6,
+    ("Zeit (s)", "Zeit (ms)"): 1000,
+}
+
+
+@pytest.mark.parametrize("names", PARTS)
+def test_seconds_and_the_rest_of_them_in_two_columns(names: tuple[str, str], tmp_path: Path, drive: Tables) -> None:
+    """As exports of ROS have them, also where the sensors are known by their numbers alone behind a count of rows."""
+    imu, gnss = drive["imu"], drive["gnss"]
+    parts = {kind: dict(zip(names, in_two(drive[kind].t, PARTS[names]))) for kind in ("imu", "gnss")}
+    table = pd.DataFrame({"Header": np.arange(len(imu)), **parts["imu"], **{f"q.{x}": 0.5 for x in "xyzw"}})
+    for name, columns in (("Linear", ACCEL), ("Angular", GYRO)):
+        table[[f"{name}.{axis}" for axis in "xyz"]] = imu[list(columns)]
+    table.to_csv(tmp_path / "a.csv", index=False)
+    fixes(gnss, ENGLISH, **parts["gnss"]).to_csv(tmp_path / "b.csv", index=False)
+    got, notes = read(tmp_path, drive)
+    np.testing.assert_allclose(got.gnss.t, gnss.t, atol=0.012)
+    assert f"({', '.join(names)}): taken as Unix time" in notes
+    time = {"column": list(names), "offset_s": 0.0}
+    (again,) = AutoReader(imu={"time": time}, gnss={"time": time}).read(tmp_path)
+    np.testing.assert_allclose(again.imu.t, got.imu.t, atol=1e-6)
+
+
+FAULTY_PARTS = {
+    "no unit": (
+        ["whole", "rest"],
+        None,
+        r"time\.unit is s, must be ms, us or ns: of 'rest', beside the seconds in 'whole'",
+    ),
+    "another unit": (["whole", "rest"], "us", r"line 2: column 'rest' is \d+, must be below 1000000 \(us beside"),
+    "exchanged": (["part", "rest"], "ns", "line 2: column 'part' is 0.01, must be whole seconds beside 'rest'"),
+}
+
+
+@pytest.mark.parametrize("case", [None, *FAULTY_PARTS])
+def test_seconds_and_the_rest_that_settings_name(case: str | None, tmp_path: Path, drive: Tables) -> None:
+    whole, rest = in_two(drive["imu"].t, 10**9)
+    imu = drive["imu"].assign(whole=whole, rest=rest, part=drive["imu"].t)
+    imu.to_csv(tmp_path / "imu.csv", index=False)
+    drive["gnss"].assign(t=UNIX + drive["gnss"].t).to_csv(tmp_path / "gnss.csv", index=False)
+    column, unit, said = FAULTY_PARTS[case] if case else (["whole", "rest"], "ns", "")
+    reader = log_reader(imu__time={"column": column, "unit": unit})
+    if case:
+        with pytest.raises(InputError, match=said):
+            list(reader.read(tmp_path))
+        return
+    (got,) = reader.read(tmp_path)
+    np.testing.assert_allclose(got.imu.t, drive["imu"].t, atol=1e-6)

@@ -13,7 +13,7 @@ import pandas as pd
 
 from dlkf.base.errors import InputError, did_you_mean, list_some
 from dlkf.data.bursts import follow_at_once
-from dlkf.data.readers import units
+from dlkf.data.readers import units, vocabulary
 from dlkf.data.readers.frames import LogTable
 
 Spec = Mapping[str, Any]
@@ -190,7 +190,7 @@ class Mapped:
             elif wraps_s is not None:
                 raise InputError(f"{where}.wraps_s={wraps_s}: stamps with a date do not start again; leave it out")
         else:
-            values = self.column(name[-1] if isinstance(name, list) else name, nan=False)
+            values, unit = self._numbers(name, unit)
         day = None if time.get("day") is None else str(time["day"])
         if unit == units.HHMMSS:
             values, unit = units.seconds_of_day(values), "s"
@@ -204,6 +204,33 @@ class Mapped:
             week = np.full(len(self), int(time["week_number"]))
         order = None if time.get("order") is None else str(time["order"])
         return units.seconds(values, unit, week, time.get("clock"), f"{self.table.path}, {where}", day, order)
+
+    def first_count_s(self) -> float:
+        """The first row's stamp [s] as the table has it, of numbers."""
+        values, unit = self._numbers(self.time["column"], self.time.get("unit") or "s")
+        return float(values[0]) / units.TIME[unit]
+
+    def _numbers(self, name: Any, unit: str) -> tuple[np.ndarray, str]:
+        """A column of stamps and its unit, the last of several; of two columns of numbers (not of hhmmss) the sum of
+        whole seconds and of the rest, in ``unit`` or in that of its name."""
+        names = name if isinstance(name, list) else [name]
+        if len(names) != 2 or unit == units.HHMMSS or not pd.api.types.is_numeric_dtype(self._cells(names[0])):
+            return self.column(names[-1], nan=False), unit
+        (first, second), where = names, f"reader.{self.kind}.time"
+        of_rest = vocabulary.find_fraction(str(second)) if unit == "s" else unit
+        if of_rest is None:
+            raise InputError(
+                f"{where}.unit is {unit}, must be ms, us or ns: of {second!r}, beside the seconds in {first!r}"
+            )
+        whole, rest = (self.column(one, nan=False) for one in (first, second))
+        ticks = units.factor(of_rest, units.TIME, f"{where}.unit")
+        if len(bad := np.flatnonzero(whole % 1 != 0)):
+            self.fail(int(bad[0]), first, f"is {whole[bad[0]]}, must be whole seconds beside {second!r}")
+        if len(bad := np.flatnonzero((rest < 0) | (rest >= ticks))):
+            limit = f"must be below {ticks:.0f} ({of_rest} beside the seconds in {first!r})"
+            self.fail(int(bad[0]), second, f"is {rest[bad[0]]}, {limit}")
+        billion = units.TIME["ns"]
+        return whole.astype(np.int64) * billion + np.round(rest * (billion / ticks)).astype(np.int64), "ns"
 
     def scale(self, key: str, table: Mapping[str, float], name: str = "unit") -> float:
         """SI per unit of an entry; the first unit of the table if the entry has none."""

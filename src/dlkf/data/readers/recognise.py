@@ -70,6 +70,7 @@ def imu_spec(
     spec = by_numbers.imu_spec(frame)
     if spec is None:
         return None
+    spec |= _find_named_time(table, SLOWEST_IMU_S, FASTEST_IMU_S, named_time)
     columns = [*spec["accel"]["columns"], *spec["gyro"]["columns"]]
     notes = () if _are_unnamed(names) else (f"took {', '.join(columns[:3])} for the accelerometers by gravity, "
                                         f"{', '.join(columns[3:])} for the gyroscopes",)  # fmt: skip
@@ -126,12 +127,13 @@ def gnss_spec(
         spec = by_numbers.gnss_spec(table)
         if spec is None:
             return None
+        spec |= _find_named_time(table, SLOWEST_FIX_S, FASTEST_FIX_S, named_time)
         columns = ", ".join(spec["position"]["columns"])
         more = "; found others by the way between the positions" if spec["velocity"].get("columns") else ""
         note = f"took {columns} for latitude, longitude, height{more}"
         return Recognised(spec, () if _are_unnamed(names) else (note,))
     known = frame[[lat, lon]].notna().all(axis=1)
-    rows, held = _find_repeated(table.frame[known], [lat, lon], stamps.find_named(frame, named_time))
+    rows, held = stamps.find_repeated(table.frame[known], [lat, lon], stamps.find_named(frame, named_time))
     known[known] = ~held
     time = stamps.time_spec(table, known, SLOWEST_FIX_S, FASTEST_FIX_S, named_time)
     if time is None or height is None:
@@ -170,6 +172,14 @@ def gnss_spec(
     return Recognised(out, (*more, *notes), receiver.refusal)
 
 
+def _find_named_time(table: LogTable, slowest: float, fastest: float, named: Mapping[str, Any]) -> Spec:
+    """The entry ``time`` of a mapping by the settings; empty where they name no column of the table."""
+    if not stamps.find_named(table.frame, named):
+        return {}
+    time = stamps.time_spec(table, pd.Series(True, table.frame.index), slowest, fastest, named)
+    return {} if time is None else {"time": time}
+
+
 def _velocity_by_numbers(table: LogTable, frame: pd.DataFrame, time: Spec, position: Spec) -> Spec:
     """Velocities under names that are not known: columns that agree with the way between the positions."""
     t = stamps.read_seconds(LogTable(table.frame.loc[frame.index], table.path, table.row), time)
@@ -188,20 +198,6 @@ def _hemispheres(frame: pd.DataFrame) -> list[str] | None:
     letters = {n: set(frame[n].astype(str).str.strip().str.upper()) for n in texts}
     sides = [next((n for n in texts if letters[n] <= both), None) for both in ({"N", "S"}, {"E", "W"})]
     return [side for side in sides if side is not None] if all(sides) and len(frame) else None
-
-
-def _find_repeated(frame: pd.DataFrame, place: list[str], clock: list[str]) -> tuple[str | None, pd.Series]:
-    """Rows that repeat the fix before, and the setting ``rows`` that leaves them out, None where there are none: in a
-    table of fixes those with its stamp too, of the columns ``clock`` or by name; beside samples of an IMU most rows."""
-    names = [str(c) for c in frame.columns]
-    same = (frame[place] == frame[place].shift()).all(axis=1)
-    if vocabulary.find_triads(names):
-        most = len(frame) >= 10 and same.mean() > 0.5
-        return ("changed", same) if most else (None, same & False)
-    if times := clock or vocabulary.match_columns(names, vocabulary.TIME):
-        same &= (frame[times] == frame[times].shift()).all(axis=1)
-        return ("once" if same.any() else None), same
-    return None, same & False
 
 
 def aid_specs(table: LogTable, called: str, time: Spec | None = None, taken: Collection[str] = ()) -> dict[str, Spec]:

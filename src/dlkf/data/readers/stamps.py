@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
@@ -48,6 +49,8 @@ def time_spec(
     called = chosen or vocabulary.match_columns(names, vocabulary.TIME)
     if (dated := _find_dates(frame, called, vocabulary.match_columns(names, vocabulary.DATE))) is not None:
         return dated
+    if (pair := find_pair(frame, slowest, fastest)) is not None:
+        return pair
     dates = [name for name in vocabulary.match_columns(names, vocabulary.DATE) if _counts_days(frame[name], slowest)]
     numbers = [name for name in (*called, *dates) if pd.api.types.is_numeric_dtype(frame[name])]
     column = numbers[0] if numbers else find_rising(frame)
@@ -74,11 +77,39 @@ def time_spec(
     return spec | ({"clock": clock} if clock else {})
 
 
+def find_pair(frame: pd.DataFrame, slowest: float, fastest: float) -> Spec | None:
+    """Whole seconds in one column and the rest of them in another, as ROS has them; None where no two are such."""
+    pair = vocabulary.find_seconds(str(n) for n in frame if pd.api.types.is_numeric_dtype(frame[n]))
+    if pair is None:
+        return None
+    spec: Spec = {"column": [*pair], "unit": vocabulary.find_fraction(pair[1])}
+    t = read_seconds(LogTable(frame, Path(pair[0])), spec)
+    steps = np.empty(0) if t is None else np.diff(t)[np.diff(t) > 0]
+    if not len(steps) or not fastest <= np.median(steps) <= slowest:
+        return None
+    clock = choose_clock(pair[0], float(frame[pair[0]].median()))
+    return spec | ({"clock": clock} if clock else {})
+
+
 def find_named(frame: pd.DataFrame, named: Mapping[str, Any]) -> list[str]:
     """The columns of the stamps that a user's settings name, where a table has them all; else none."""
     column = named.get("column")
     columns = [str(c) for c in (column if isinstance(column, (list, tuple)) else [column]) if c is not None]
     return columns if {*columns} <= {*map(str, frame.columns)} else []
+
+
+def find_repeated(frame: pd.DataFrame, place: list[str], clock: list[str]) -> tuple[str | None, pd.Series]:
+    """Rows that repeat the fix before, and the setting ``rows`` that leaves them out, None where there are none: in a
+    table of fixes those with its stamp too, of the columns ``clock`` or by name; beside samples of an IMU most rows."""
+    names = [str(c) for c in frame.columns]
+    same = (frame[place] == frame[place].shift()).all(axis=1)
+    if vocabulary.find_triads(names):
+        most = len(frame) >= 10 and same.mean() > 0.5
+        return ("changed", same) if most else (None, same & False)
+    if times := clock or vocabulary.match_columns(names, vocabulary.TIME):
+        same &= (frame[times] == frame[times].shift()).all(axis=1)
+        return ("once" if same.any() else None), same
+    return None, same & False
 
 
 def _is_clock_face(values: np.ndarray, slowest: float) -> bool:
@@ -220,7 +251,7 @@ def _describe_epoch(part: Mapped, columns: list[str], setting: str) -> str | Non
 def _describe_count(part: Mapped, column: str, setting: str) -> str | None:
     """From when seconds in a column count, by their size."""
     unit, clock = part.time.get("unit") or "s", part.time.get("clock")
-    seconds = float(part.column(column, nan=False)[0]) / units.TIME[unit]
+    seconds = part.first_count_s()
     known = {"unix": "unix", "utc": "unix", "gps": "gps"}.get(str(clock)) or units.clock_by_size(seconds)
     if known is None:
         counter = unit == XSENS_TICK  # runs since the device was switched on
