@@ -215,7 +215,8 @@ def aid_specs(table: LogTable, called: str, time: Spec | None = None, taken: Col
     if wheels:
         found["speed"] = {"value": _wheel_value(numbers, wheels)}
     headings = [n for n in names if vocabulary.has(n, vocabulary.HEADING)]
-    if not headings and not places and vocabulary.has(called, rf"{vocabulary.HEADING}|^heading$"):
+    compass = any(vocabulary.has(n, vocabulary.COMPASS) for n in names)
+    if not headings and not places and not compass and vocabulary.has(called, rf"{vocabulary.HEADING}|^heading$"):
         headings = [n for n in names if n == vocabulary.find_column([n], "course")]
     if headings:
         degrees = float(np.nanmax(np.abs(numbers[headings[0]]))) > 2 * np.pi + 0.01

@@ -94,7 +94,8 @@ SPEEDS += r"|impulse?|odo(?:meter)?|distance|weg)\b|速|オドメータ"
 NO_WHEEL = r"\b(?:gps|gnss|diff\w*|average|avg|mean|max\w*|trip|engine|motor|fan|std|acc\w*|angle|steer\w*|time)\b"
 COUNTED = r"\b(?:ticks?|counts?|pulses?|impulse?|odo(?:meter)?|distance|weg)\b"
 REAR = r"\b(?:rl|rr|rear|hl|hr|hinten|arriere|trasera)\b|后|後"
-HEADING = r"\b(?:hdt|ths|dual|baseline|relpos\w*|antennas?|moving ?base|true ?heading)\b"
+HEADING = r"\b(?:hdt|ths|dual|baseline|relpos\w*|antennas?|moving ?base)\b"  # "true heading" is a phone's compass
+COMPASS = r"\b(?:magn\w*|compass|kompass)\b"
 PRESSURE = r"(?:baro(?:meter|metric)? ?)?(?:air ?)?(?:press(?:ure)?|luftdruck|druck|pression|presion|气压|氣壓|気圧)"
 BARO_HEIGHT = r"baro(?:metric|meter)? ?(?:alt(?:itude)?|height)|relative ?altitude"
 
