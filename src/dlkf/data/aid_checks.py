@@ -16,6 +16,7 @@ from dlkf.data.tables import Columns, refuse_rows
 
 RATES_HZ = (0.02, 1000.0)
 FAST = 3.0  # m/s: above, the ratio of two speeds means something and the car looks along its course
+TURNS = 0.05  # m/s: above, a wheel turns
 LEAST_COMMON = 10  # instants at which an aid and GNSS are compared
 ENOUGH = 5000  # instants to find the lag of a clock by
 SCALES = (0.7, 1.4)  # of a wheel to GNSS that a filter may calibrate; beyond, the unit is wrong
@@ -84,7 +85,11 @@ def _check_speed(table: Columns, moved: Motion, where: str) -> None:
             f"{where}: the clock of the speed is {abs(lag_s):.1f} s {'ahead of' if lag_s > 0 else 'behind'} that of "
             f"GNSS; {'subtract' if lag_s > 0 else 'add'} {abs(lag_s):.2f} s {'from' if lag_s > 0 else 'to'} its t"
         )
-    ratio = float(np.median(np.interp(at + lag_s, t, v)[fast] / ground[fast]))
+    wheel, ground = np.interp(at + lag_s, t, v)[fast], ground[fast]
+    turns = np.abs(wheel) > TURNS  # a car that is carried, on a train or a ferry, has a wheel that stands
+    if turns.sum() >= LEAST_COMMON:
+        wheel, ground = wheel[turns], ground[turns]
+    ratio = float(np.median(wheel / ground))
     if SCALES[0] <= ratio <= SCALES[1]:
         return
     if SCALES[0] <= -ratio <= SCALES[1]:
