@@ -198,7 +198,7 @@ class Mapped:
         if unit in units.DAYS:
             values, unit = (values - units.DAYS[unit]) * 86_400.0, "s"
         if wraps_s is not None:
-            values = units.unwrap_stamps(values, float(wraps_s) * units.TIME.get(unit, 1))
+            values = units.unwrap_stamps(values, float(wraps_s), units.TIME.get(unit, 1))
         week = self.column(time["week"], nan=False) if time.get("week") is not None else None
         if time.get("week_number") is not None:
             week = np.full(len(self), int(time["week_number"]))
