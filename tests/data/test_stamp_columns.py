@@ -11,9 +11,9 @@ import pytest
 from dlkf.base.errors import InputError
 from dlkf.data.readers.auto import AutoReader
 from dlkf.data.schema import ACCEL, GYRO
-from tests.data.logs.clock import UNIX
+from tests.data.logs.clock import DEG, UNIX
 from tests.data.test_csv import log_reader
-from tests.data.test_foreign_tables import ENGLISH, Tables, box, fixes, read
+from tests.data.test_foreign_tables import ENGLISH, Tables, beside, box, fixes, read
 
 
 def test_fixes_written_several_times_with_their_own_stamp(tmp_path: Path, drive: Tables) -> None:
@@ -105,3 +105,26 @@ def test_seconds_and_the_rest_that_settings_name(case: str | None, tmp_path: Pat
         return
     (got,) = reader.read(tmp_path)
     np.testing.assert_allclose(got.imu.t, drive["imu"].t, atol=1e-6)
+
+
+def test_the_stamps_of_fixes_beside_samples_in_local_time(tmp_path: Path, streets: Tables) -> None:
+    """SensorLog without a zone in its texts: fixes have their own times, also where they repeat a position, and the
+    samples' dates are brought to theirs, as is a pressure beside them."""
+    imu, gnss = streets["imu"], streets["gnss"].copy()
+    gnss.loc[20:23, ["lat_deg", "lon_deg", "height_m"]] = gnss.loc[20, ["lat_deg", "lon_deg", "height_m"]].to_numpy()
+    names = ";".join(f"location{x}" for x in ("Latitude(WGS84)", "Longitude(WGS84)", "Altitude(m)"))
+    stamps = {"t": gnss.t, "locationTimestamp_since1970(s)": (UNIX + gnss.t).round(6)}
+    place = fixes(gnss, f"{names};locationSpeed(km/h);locationCourse(°)", **stamps)
+    when = pd.to_datetime(UNIX - 5 * 3600 + imu.t, unit="s").dt.strftime("%Y-%m-%d %H:%M:%S.%f").str[:-3]
+    samples = box(imu, "accelerometerAcceleration{}(G)", "gyroRotation{}(rad/s)", **{"loggingTime(txt)": when})
+    samples.iloc[:, 4:] *= DEG
+    samples["pressure(kPa)"] = 95.0
+    pd.concat((samples, beside(imu, place)), axis=1).to_csv(tmp_path / "phone.csv", index=False)
+    (got,) = AutoReader().read(tmp_path)
+    notes = "\n".join(got.notes)
+    assert "-5 h from UTC by the fixes' stamps, so they are local time" in notes
+    assert "the others repeat the stamp and position before" in notes and len(got.gnss) in (len(gnss), len(gnss) - 1)
+    assert got.mapping["gnss"]["time"]["column"] == "locationTimestamp_since1970(s)"
+    assert abs(got.gnss.t.iloc[30] - got.gnss.t.iloc[0] - 30 * np.median(np.diff(gnss.t))) < 1e-3
+    assert abs(got.mapping["gnss"]["time"]["offset_s"]) < 0.1 and got.imu.t.iloc[0] < 1.0
+    assert abs(got.aids["baro"].t.iloc[0] - got.imu.t.iloc[0]) < 1e-6

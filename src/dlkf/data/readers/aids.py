@@ -135,6 +135,7 @@ def _offset(wheel: Wheel, raw: pd.DataFrame, imu: pd.DataFrame) -> tuple[float, 
         return found, by_gnss + describe_offset(wheel.lag_s)
     late = f"that speed is {abs(force[0]):.1f} s {'late' if force[0] < 0 else 'early'}"
     by_imu = f"by the IMU's forward acceleration, which agrees to {force[1]:.2f} of 1"
+    by_gnss += describe_offset(wheel.lag_s)
     return round(wheel.lag_s + force[0], 2), f"{by_imu}; by the speed of GNSS {by_gnss}: {late}"
 
 

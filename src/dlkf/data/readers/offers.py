@@ -12,7 +12,7 @@ from typing import Any
 
 from dlkf.base.config import read_preset
 from dlkf.base.errors import InputError
-from dlkf.data.readers import formats, recognise, vocabulary
+from dlkf.data.readers import formats, recognise, stamps, vocabulary
 from dlkf.data.readers.formats import autopilot, matlab, nmea, rosbag, text, ubx
 from dlkf.data.readers.frames import LogTable
 
@@ -179,6 +179,9 @@ def _offer_table(
     place = named.get("gnss", {})
     if imu is None or "position" in place or vocabulary.find_column(map(str, table.frame.columns), "lat"):
         gnss = recognise.gnss_spec(table, place, times.get("gnss", {}))
+    local = stamps.find_zone_s(table, imu.spec["time"], gnss.spec["time"]) if imu and gnss else 0
+    if local and imu is not None:
+        imu.spec["time"]["offset_s"] = -local
     source: dict[str, Any] = {"format": name, "file": path.name, "text": options}
     source |= {"table": part} if part is not None else {}
     time = next((one.spec["time"] for one in (imu, gnss) if one is not None), None)
@@ -193,6 +196,8 @@ def _offer_table(
     specs = {kind: {**source, **one.spec} for kind, one in found.items()}
     columns = ", ".join(dict.fromkeys(str(c) for spec in (specs or aids).values() for c in _columns(spec)))
     notes = tuple(note for one in found.values() for note in one.notes)
+    if local:
+        notes += (f"dates of {path.name}: {local / 3600:+g} h from UTC by the fixes' stamps, so they are local time",)
     specs = leave_open(specs | aids, stated=True)
     refusal = "" if gnss is None else gnss.refusal
     return [Offer(path, f"{name} with {columns}", specs, notes, part, refusal)] if specs else []
@@ -284,7 +289,8 @@ def leave_open(specs: Mapping[str, Any], stated: bool = False) -> dict[str, dict
                 unit = spec[key].get("unit") if stated else None
                 spec[key] = {**spec[key], "unit": unit or "auto", "axes": "auto"}
         elif kind not in ("accel", "gyro"):
-            spec["time"] = {**spec["time"], "offset_s": "auto"}
+            known = spec["time"].get("offset_s") if stated else None  # of samples' dates in local time
+            spec["time"] = {**spec["time"], "offset_s": "auto" if known is None else known}
         if kind == "gnss":
             spec["time"]["drift_ppm"] = "auto"
             spec["velocity"] = {**(spec.get("velocity") or {}), "unit": "auto"}

@@ -133,7 +133,10 @@ def gnss_spec(
         note = f"took {columns} for latitude, longitude, height{more}"
         return Recognised(spec, () if _are_unnamed(names) else (note,))
     known = frame[[lat, lon]].notna().all(axis=1)
-    rows, held = stamps.find_repeated(table.frame[known], [lat, lon], stamps.find_named(frame, named_time))
+    clock = stamps.find_named(table.frame, named_time)
+    if not clock and (clock := vocabulary.match_columns(names, vocabulary.SINCE_1970)[:1]):
+        named_time = {**named_time, "column": clock[0]}
+    rows, held = stamps.find_repeated(table.frame[known], [lat, lon], clock)
     known[known] = ~held
     time = stamps.time_spec(table, known, SLOWEST_FIX_S, FASTEST_FIX_S, named_time)
     if time is None or height is None:
@@ -232,7 +235,7 @@ def aid_specs(table: LogTable, called: str, time: Spec | None = None, taken: Col
         column = (spec.get("value") or spec["pressure"])["columns"] or spec["height"]["columns"]
         known = time or stamps.time_spec(table, numbers[column[0]].notna(), SLOWEST_AID_S, FASTEST_AID_S)
         if known is not None:
-            out[name] = {"time": {**known, "offset_s": "auto"}, "rows": "filled", **spec}
+            out[name] = {"time": {"offset_s": "auto", **known}, "rows": "filled", **spec}
     return out
 
 

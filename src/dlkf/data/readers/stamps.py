@@ -28,6 +28,7 @@ NEWEST_UNIX = 2e9  # s: 2033; a stamp beyond it counts from no known epoch
 NAMED_ZONE = r"(?:Z|UTC|GMT|[+-]\d{2}:?\d{2})\s*$"
 QUARTER_S, LEAST_ZONE_S = 900, 3600  # time zones are whole quarters of an hour
 SWITCHED_ON_S = 1000.0  # a log that begins with less counts from its own beginning, which is nothing to report
+MOST_REPEATED = 0.5  # of the rows, which repeat the fix before where it is beside samples
 XSENS_TICK = "1e-4s"
 CLOCK_NAMES = {"gps": "GPS time", None: "of an unnamed clock"}  # of calendar texts; else UTC
 OLDEST_UNIX = 1.0e9  # s: 2001; no log of a car with an IMU of this kind is older
@@ -99,17 +100,33 @@ def find_named(frame: pd.DataFrame, named: Mapping[str, Any]) -> list[str]:
 
 
 def find_repeated(frame: pd.DataFrame, place: list[str], clock: list[str]) -> tuple[str | None, pd.Series]:
-    """Rows that repeat the fix before, and the setting ``rows`` that leaves them out, None where there are none: in a
-    table of fixes those with its stamp too, of the columns ``clock`` or by name; beside samples of an IMU most rows."""
+    """Rows that repeat the fix before, and the setting ``rows`` that leaves them out, None where there are none: those
+    with its stamp too, of the columns ``clock`` or by name; beside samples of an IMU, whose stamps are others, most."""
     names = [str(c) for c in frame.columns]
     same = (frame[place] == frame[place].shift()).all(axis=1)
-    if vocabulary.find_triads(names):
-        most = len(frame) >= 10 and same.mean() > 0.5
-        return ("changed", same) if most else (None, same & False)
-    if times := clock or vocabulary.match_columns(names, vocabulary.TIME):
-        same &= (frame[times] == frame[times].shift()).all(axis=1)
-        return ("once" if same.any() else None), same
-    return None, same & False
+    times = clock or vocabulary.match_columns(names, vocabulary.TIME)
+    again = same & (frame[times] == frame[times].shift()).all(axis=1) if times else same & False
+    if not vocabulary.find_triads(names):
+        return ("once" if again.any() else None), again
+    if len(frame) < 10 or same.mean() <= MOST_REPEATED:
+        return None, same & False
+    return ("once", again) if clock and again.mean() > MOST_REPEATED else ("changed", same)
+
+
+def find_zone_s(table: LogTable, imu: Spec, gnss: Spec) -> int:
+    """Time zone [s ahead of UTC] of the samples' calendar texts, by stamps of fixes in the same table in Unix time."""
+    both = [imu.get("column"), gnss.get("column")]
+    if imu.get("unit") != units.ISO or gnss.get("clock") != "unix" or not all(isinstance(one, str) for one in both):
+        return 0
+    rows = table.frame[both].notna().all(axis=1)
+    if not rows.any():
+        return 0
+    samples, fixes = (
+        Mapped(LogTable(table.frame[rows], table.path), {"time": time}, "imu").own_stamps()[0] for time in (imu, gnss)
+    )
+    ahead_s = float(np.median(samples - fixes))
+    zone_s = QUARTER_S * round(ahead_s / QUARTER_S)
+    return zone_s if LEAST_ZONE_S <= abs(zone_s) <= FARTHEST_ZONE_H * 3600 and abs(ahead_s - zone_s) < 40 else 0
 
 
 def _is_clock_face(values: np.ndarray, slowest: float) -> bool:

@@ -112,6 +112,7 @@ TIME = (
 DATE = r"(?:(?:utc|gps|local|gnss) ?)?(?:date|datum|tag|jour|fecha|dia|日期|日付|年月日)(?: (?:utc|gps|local|lokal))?"
 SECONDS = r"(?:s|secs?|seconds?)"
 FRACTIONS = {"ns": rf"n(?:ano)? ?{SECONDS}", "us": rf"(?:u|micro) ?{SECONDS}", "ms": rf"(?:m|milli) ?{SECONDS}"}
+SINCE_1970 = r"(?:location |gps |gnss )?time ?stamp since ?1970"  # of a fix itself, beside samples
 CLOCKS = {"unix": r"\b(unix|posix|epoch|ros)\b", "gps": r"\b(gps|gpst|gnss|tow|sow|itow)\b", "utc": r"\butc\b"}
 
 # units as words (brackets and signs gone): the quantity's unit as the mapping calls it
