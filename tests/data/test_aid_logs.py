@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -12,6 +14,8 @@ from dlkf.data.discovery.wheel import find_wheel
 from dlkf.data.intake import IngestOptions, ingest, ingest_drives
 from dlkf.data.readers import formats
 from dlkf.data.readers.auto import AutoReader
+from dlkf.data.readers.frames import LogTable
+from dlkf.data.readers.recognise import aid_specs
 from dlkf.data.tables import read_table
 from tests.cars import car
 from tests.data.logs.bags import _Bag, ros2
@@ -330,3 +334,21 @@ def test_what_a_wheel_cannot_tell(drive):
         found = find_wheel(t - offset, drive["wheel"].speed.to_numpy(), moved)
         assert found is not None and found.lag_s == pytest.approx(offset, abs=0.01)
         assert found.scale == pytest.approx(1 / SCALE, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    "called, names, taken",
+    [
+        ("phone", ["locationTrueHeading(°)", "locationMagneticHeading(°)"], None),
+        ("phone", ["trueHeading"], None),
+        ("heading", ["trueHeading", "magneticHeading"], None),
+        ("heading", ["heading"], "heading"),
+        ("receiver", ["dual_heading"], "dual_heading"),
+    ],
+)
+def test_a_compass_is_no_heading_of_antennas(called, names, taken):
+    """It points where the phone does, and magnets of the car turn it."""
+    frame = pd.DataFrame({"t": 0.1 * np.arange(50), **{name: 90.0 + np.arange(50) for name in names}})
+    spec = aid_specs(LogTable(frame, Path("a.csv")), called)
+    assert ("heading" in spec) == (taken is not None)
+    assert taken is None or spec["heading"]["value"] == {"columns": [taken], "unit": "deg"}

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from dlkf.base.errors import InputError
 from dlkf.data.discovery.clock import ImuSums, describe_offset, find_lag
 from dlkf.data.discovery.drift import compare_ends, ends_std, find_drifting_pose, find_step, middle
-from dlkf.data.discovery.findings import discover, find_value
+from dlkf.data.discovery.findings import Finding, discover, find_value
 from dlkf.data.discovery.motion import find_motion, integrate_level, position_delay
 from dlkf.data.discovery.orientation import find_pose
 from dlkf.data.discovery.units import accel_units, nearest_unit, time_unit, unit_left
@@ -25,6 +25,7 @@ from dlkf.data.readers import units
 from dlkf.data.readers.auto import AutoReader
 from dlkf.data.readers.frames import DriveFrames
 from dlkf.data.readers.logs import LogReader
+from dlkf.data.readers.settling import _take_stated_unit
 from dlkf.data.readers.units import rotation
 from dlkf.data.schema import ACCEL, GYRO, VELOCITY
 from dlkf.data.tables import read_drives
@@ -353,3 +354,29 @@ def test_a_sensor_that_seems_turned_gets_a_line(streets):
     turned = {**imu, **dict(zip(ACCEL, turn @ np.stack([imu[c] for c in ACCEL])))}
     (line,) = describe_clocks(turned, gnss)
     assert "turned by" in line
+
+
+@pytest.mark.parametrize("name, unit", [("gyroRotation{}(rad/s)", "rad/s"), ("gyro_{}", None)])
+def test_a_unit_in_the_names_counts_where_turns_leave_it_open(name, unit, tmp_path):
+    """Fifteen seconds are too few for turns."""
+    tables = car(15)
+    imu = tables["imu"].rename(columns={c: name.format(c[-1].upper()) for c in GYRO})
+    imu.to_csv(tmp_path / "imu.csv", index=False)
+    tables["gnss"].to_csv(tmp_path / "gnss.csv", index=False)
+    axes = {"accel": {"axes": "frd"}, "gyro": {"axes": "frd"}}
+    reader = AutoReader(axes, {"time": {"offset_s": 0.0, "drift_ppm": 0.0}}, lever_arm_m=[0.0, 0.0, 0.0])
+    if unit is None:
+        with pytest.raises(InputError, match=r"not sure of reader\.imu\.gyro\.unit"):
+            list(reader.read(tmp_path))
+        return
+    (got,) = reader.read(tmp_path)
+    assert got.mapping["imu"]["gyro"]["unit"] == unit
+    assert any("gyro.unit=rad/s  (as the columns' names state; " in note for note in got.notes)
+
+
+def test_turns_count_more_than_a_unit_in_the_names():
+    """A finding that is sure, or five sigma from the unit, stays."""
+    imu = {"gyro": {"columns": ["wx (rad/s)", "wy (rad/s)", "wz (rad/s)"]}}
+    for value, std, sure, kept in (("deg/s", 1e-4, True, True), (0.3, 0.1, False, True), (0.3, 0.2, False, False)):
+        found = Finding("imu.gyro.unit", value, sure, "", std=std)
+        assert (_take_stated_unit(found, imu) == found) == kept

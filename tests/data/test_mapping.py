@@ -94,7 +94,9 @@ def test_leap_seconds_and_wrapping_counters():
     dates = ["1980-02-01", "2011-09-26", "2015-06-30T23:59:59", "2015-07-01", "2018-01-01"]
     unix = np.array(dates, "datetime64[s]").astype(np.int64)
     assert leap_seconds(unix).tolist() == [0, 15, 16, 17, 18]
-    assert unwrap_stamps(np.array([604_799.5, 0.0, 0.5]), 604_800).tolist() == [604_799.5, 604_800.0, 604_800.5]
+    assert unwrap_stamps(np.array([604_799.5, 0.0, 0.5]), 604_800, 1).tolist() == [604_799.5, 604_800.0, 604_800.5]
+    assert unwrap_stamps(np.array([500, 100, 50]), 1, 1000).tolist() == [500, 1100, 2050]  # 0.6 s lack
+    assert unwrap_stamps(np.array([30.0, 29.9, 30.1]), 65.536, 1).tolist() == [30.0, 29.9, 30.1]  # out of order
     whole, part = seconds(np.array(["2015-07-01T00:00:00.25"]), "iso", None, "gps", "")
     assert whole[0] + part[0] == unix[3] - 315_964_800 + 0.25
 
@@ -266,7 +268,7 @@ def test_no_position_yet(tmp_path, tables):
 MISTAKES = {
     "unknown key": ({"imu__accel__unti": "g"}, "reader.imu.accel: unknown key unti; did you mean unit? known"),
     "unknown format": ({"gnss__format": "gpx"}, "reader.gnss.format=gpx: unknown; known are csv"),
-    "rows": ({"imu__rows": "some"}, "reader.imu.rows is 'some', must be filled, changed or"),
+    "rows": ({"imu__rows": "some"}, "reader.imu.rows is 'some', must be filled, changed, once or"),
     "no row left": ({"imu__rows": {"column": "t", "is": ["x"]}}, "no row is left"),
     "pattern": ({"imu__lines": "("}, "is no regular expression"),
     "a name for columns": ({"imu__accel__columns": "accel_x"}, "has a single name, must have 3"),

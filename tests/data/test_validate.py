@@ -151,6 +151,8 @@ BAD = {
     "ms of 16 bits": (_set("imu", "t", lambda t: (t + 40) % 65.536), "every 65.536 s: reader.imu.time.wraps_s=65.536"),
     "us of 32 bits": (_set("imu", "t", lambda t: (t + 4260) % 4294.967296), r"wraps_s=4294.967296"),
     "another counter": (_set("imu", "t", lambda t: (t + 1) % 20), r"t goes back .*wraps_s=20$"),
+    "each second": (_set("imu", "t", lambda t: np.where(t > 30, t + 0.6, t) % 1), r"every 1 s: .*time\.wraps_s=1$"),
+    "set back again and again": (_set("imu", "t", lambda t: t - 0.4 * np.floor(t / 10)), "t goes back .*sort the rows"),
     "clock set back": (_set("imu", "t", lambda t: np.where(t > 30, t - 20, t)), "the clock was set back there"),
     "stamps of a host that gets packets of four": (
         _set("imu", "t", lambda t: np.ceil(np.arange(1, len(t) + 1) / 4) * 0.04 + 1e-4 * (np.arange(len(t)) % 4)),

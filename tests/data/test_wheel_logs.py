@@ -6,8 +6,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from dlkf.data.discovery.motion import Motion
-from dlkf.data.discovery.wheel import find_wheel
+from dlkf.base.errors import InputError
+from dlkf.data.aid_checks import check_aid
+from dlkf.data.discovery.motion import Motion, find_motion
+from dlkf.data.discovery.wheel import find_force_lag, find_wheel
 from dlkf.data.readers.counters import count_rates
 from tests.cars import car
 from tests.data.test_csv import log_reader
@@ -98,3 +100,37 @@ def test_one_of_two_wheels_is_enough_and_marks_are_unknown(tmp_path):
     assert len(table) == len(wheels) - 13
     np.testing.assert_allclose(table.speed, np.interp(table.t, tables["gnss"].t, speed), atol=1e-9)
     assert sum("left out 2 of" in note and "beyond 120 m/s" in note for note in drive.notes) == 1
+
+
+@pytest.mark.parametrize("lag_s", [-2.2, 0.0, 0.73])
+def test_the_clock_of_a_wheel_by_the_imu(lag_s):
+    """On hills, with noise; to 50 ms. Another axis, and a constant speed, show nothing."""
+    rng = np.random.default_rng(2)
+    hills = 0.5 * np.sin(T / 40)
+    forward = np.gradient(SPEED, T) + hills + rng.normal(0, 0.5, len(T))
+    found = find_force_lag(T - lag_s, 1.02 * SPEED, T, forward)
+    assert found is not None and abs(found[0] - lag_s) < 0.05 and found[1] > 0.9
+    for speed, force in ((SPEED, hills), (0 * SPEED + 9, forward), (SPEED, rng.normal(0, 1, len(T)))):
+        assert find_force_lag(T, speed, T, force) is None
+
+
+@pytest.mark.parametrize("late_s", [0.0, 1.5])
+def test_a_wheel_has_the_clock_of_the_imu_where_the_speed_of_gnss_is_late(tmp_path, late_s):
+    """As phones give it; the check of a dataset takes such a wheel too, and refuses one on another clock."""
+    tables = car(120)
+    imu, gnss = tables["imu"], tables["gnss"]
+    speed, truth = np.hypot(gnss.vel_n, gnss.vel_e), tables["reference"]
+    late = {c: np.interp(gnss.t - late_s, truth.t, truth[c]) for c in ("vel_n", "vel_e")}
+    imu.to_csv(tmp_path / "imu.csv", index=False)
+    gnss.assign(**late).to_csv(tmp_path / "gnss.csv", index=False)
+    at = np.arange(1, 119, 0.1)
+    pd.DataFrame({"t": at - 0.7, "v": np.interp(at, gnss.t, speed)}).to_csv(tmp_path / "wheel.csv", index=False)
+    said = {"file": "wheel.csv", "time": {"column": "t", "offset_s": "auto"}, "value": {"columns": ["v"]}}
+    (drive,) = log_reader(speed=said).read(tmp_path)
+    assert drive.mapping["speed"]["time"]["offset_s"] == pytest.approx(0.7, abs=0.05)
+    assert any("that speed is 1.5 s late" in note for note in drive.notes) == (late_s > 0)
+    samples, moved = ({c: x[c].to_numpy() for c in x} for x in (imu, gnss.assign(**late)))
+    wheel = {"t": at, "speed": np.interp(at, gnss.t, speed)}
+    check_aid("speed", wheel, samples, find_motion(moved), "a")
+    with pytest.raises(InputError, match="the clock of the speed is"):
+        check_aid("speed", {**wheel, "t": at - 1.2}, samples, find_motion(moved), "a")

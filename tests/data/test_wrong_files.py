@@ -8,8 +8,10 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import pytest
+import scipy.io
 
 from dlkf.base.errors import InputError
 from dlkf.data.readers.auto import AutoReader
@@ -150,3 +152,26 @@ def test_hardly_anything_of_a_ubx_log_is_one_line(keep, said, logged, tmp_path):
     with pytest.raises(InputError, match=said) as refused:
         list(AutoReader(imu={"file": "imu.csv"}).read(tmp_path))
     assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("lacking", [["time"], ["altitude"]])
+def test_positions_that_make_no_fixes_are_no_log_at_rest(tmp_path, lacking):
+    """In a structure of their own, and beside the samples; without GNSS only where the settings say so."""
+    t = 0.01 * np.arange(400)
+    imu = {"time": t, **{f"{stem}_{axis}": 0 * t for stem in ("acc", "gyr") for axis in "xyz"}}
+    imu["acc_z"] = imu["acc_z"] - 9.8
+    place = {"time": t, "latitude": 50 + 1e-6 * t, "longitude": 8 + 1e-6 * t, "altitude": 90.0 + 0 * t}
+    place = {name: values for name, values in place.items() if name not in lacking}
+    scipy.io.savemat(tmp_path / "drive.mat", {"imu": imu, "gps": place})
+    with pytest.raises(InputError, match=r"no fixes found in drive\.mat \(gps: .*has positions, lacks"):
+        list(AutoReader().read(tmp_path))
+    for named in ({"table": "gps"}, {"position": {"columns": ["latitude", "longitude", "altitude"]}}):
+        with pytest.raises(InputError, match=r"no GNSS found for reader\.gnss\.(table|position).* \(gps: .*lacks"):
+            list(AutoReader(gnss=named).read(tmp_path))
+    (got,) = AutoReader(gnss={"file": None}).read(tmp_path)
+    assert got.gnss is None
+    if lacking == ["altitude"]:
+        (tmp_path / "drive.mat").unlink()
+        pd.DataFrame({**imu, **place}).to_csv(tmp_path / "drive.csv", index=False)
+        with pytest.raises(InputError, match=r"no fixes found in drive\.csv \(.*lacks a height"):
+            list(AutoReader().read(tmp_path))

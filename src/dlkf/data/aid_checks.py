@@ -11,11 +11,13 @@ import numpy as np
 from dlkf.base.angles import circular_median
 from dlkf.base.errors import InputError
 from dlkf.data.discovery.motion import Motion
+from dlkf.data.discovery.wheel import find_force_lag
 from dlkf.data.schema import OPTIONAL
 from dlkf.data.tables import Columns, refuse_rows
 
 RATES_HZ = (0.02, 1000.0)
 FAST = 3.0  # m/s: above, the ratio of two speeds means something and the car looks along its course
+TURNS = 0.05  # m/s: above, a wheel turns
 LEAST_COMMON = 10  # instants at which an aid and GNSS are compared
 ENOUGH = 5000  # instants to find the lag of a clock by
 SCALES = (0.7, 1.4)  # of a wheel to GNSS that a filter may calibrate; beyond, the unit is wrong
@@ -54,7 +56,7 @@ def check_aid(name: str, table: Columns, imu: Columns, moved: Motion, where: str
             f"{imu['t'][-1]:.3f}; both need the same clock"
         )
     if name == "speed":
-        _check_speed(table, moved, where)
+        _check_speed(table, imu, moved, where)
     elif name == "heading":
         _check_heading(table, moved, where)
     elif name == "baro":
@@ -65,7 +67,7 @@ def _leaving_out(name: str) -> str:
     return f"leave it out (reader.{name}.file=null in ingest, an aids= without {name} elsewhere)"
 
 
-def _check_speed(table: Columns, moved: Motion, where: str) -> None:
+def _check_speed(table: Columns, imu: Columns, moved: Motion, where: str) -> None:
     known = np.isfinite(table["speed"])
     t, v = table["t"][known], table["speed"][known]
     at, ground = _common(t, moved)
@@ -79,12 +81,16 @@ def _check_speed(table: Columns, moved: Motion, where: str) -> None:
             f"is dead; {_leaving_out('speed')}"
         )
     lag_s = _lag(t, v, at, ground)
-    if abs(lag_s) > APART_S:
+    if abs(lag_s) > APART_S and not _agrees_with_imu(t, v, imu):
         raise InputError(
             f"{where}: the clock of the speed is {abs(lag_s):.1f} s {'ahead of' if lag_s > 0 else 'behind'} that of "
             f"GNSS; {'subtract' if lag_s > 0 else 'add'} {abs(lag_s):.2f} s {'from' if lag_s > 0 else 'to'} its t"
         )
-    ratio = float(np.median(np.interp(at + lag_s, t, v)[fast] / ground[fast]))
+    wheel, ground = np.interp(at + lag_s, t, v)[fast], ground[fast]
+    turns = np.abs(wheel) > TURNS  # a car that is carried, on a train or a ferry, has a wheel that stands
+    if turns.sum() >= LEAST_COMMON:
+        wheel, ground = wheel[turns], ground[turns]
+    ratio = float(np.median(wheel / ground))
     if SCALES[0] <= ratio <= SCALES[1]:
         return
     if SCALES[0] <= -ratio <= SCALES[1]:
@@ -92,6 +98,12 @@ def _check_speed(table: Columns, moved: Motion, where: str) -> None:
     close = [text for text, factor in UNITS.items() if abs(np.log(max(ratio, 1e-9) / factor)) < 0.1]
     looks = f": looks like {close[0]}" if close else "; it must be in m/s, correct its scale (reader.speed.value.unit)"
     raise InputError(f"{where}: speed is {ratio:.2f} times that of GNSS in the median{looks}")
+
+
+def _agrees_with_imu(t: np.ndarray, v: np.ndarray, imu: Columns) -> bool:
+    """Whether the speed has the clock of the IMU, so that it is the speed of GNSS that is late."""
+    force = find_force_lag(t, v, imu["t"], imu["accel_x"])
+    return force is not None and abs(force[0]) <= APART_S
 
 
 def _lag(t: np.ndarray, v: np.ndarray, at: np.ndarray, ground: np.ndarray) -> float:

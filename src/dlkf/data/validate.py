@@ -34,6 +34,7 @@ MOST_HOURS = 14  # between time zones
 LEAST_SPAN_S, LEAST_SHARED = 10.0, (1.0, 0.02)  # of fixes; by them and the IMU: seconds, share of the shorter
 NEAR_WRAP_S = 60.0
 COUNTERS_S = (2**16 / 1e3, 2**32 / 1e6, 2**32 / 1e3)  # of ms in 16 bits; of us, of ms in 32
+LEAST_WRAP, MOST_WRAPS = 5.0, 0.9  # usual steps in a counter's turn; share of its jumps back that are of one size
 SET_BACK_S, MOST_SET_BACK = 5.0, 10  # stamps that go back by more, but not often, are of a clock that was set back
 
 
@@ -167,7 +168,11 @@ def check_time(t: np.ndarray, where: str, kind: str = "imu", name_row: Callable[
         k = int(back[0])
         if (same := int((np.diff(t) == 0).sum())) > MOST_SAME * len(t):
             rounding = _describe_rounding(t)
-            remedy = rounding if kind == "imu" else f"remove duplicate rows; if there are none, {rounding}"
+            remedy = (
+                rounding
+                if kind == "imu"
+                else f"remove duplicate rows (reader.{kind}.rows=once); if there are none, {rounding}"
+            )
             raise InputError(
                 f"{where}: {same} of {len(t)} rows have the stamp of the row before: {remedy} "
                 f"(reader.{kind}.time.respace=true spreads such rows evenly)"
@@ -197,16 +202,20 @@ def _explain_return(t: np.ndarray, k: int, kind: str) -> str:
 
 
 def _find_wrap(t: np.ndarray) -> float | None:
-    """The seconds after which a counter starts again: several jumps back of one size, or one of a counter's; None where
-    they are not."""
+    """The seconds after which a counter starts again: jumps back of that of a counter, or most of one size in which all
+    stamps lie; None where they are not."""
     step = np.diff(t)
     usual = float(np.median(step))
     wraps = usual - step[step < 0]
     near = [size for size in COUNTERS_S if (np.abs(wraps - size) <= 2 * usual).all()]
     if near:
         return near[0]
-    several = len(wraps) > 1 and float(np.median(wraps)) > SET_BACK_S and np.ptp(wraps) <= 2 * usual
-    return float(np.median(wraps)) if several else None
+    wrap = float(np.median(wraps))
+    if len(wraps) < 2 or wrap < LEAST_WRAP * usual or np.ptp(t) > wrap + 2 * usual:
+        return None
+    if np.mean(np.abs(wraps - wrap) <= 2 * usual) < MOST_WRAPS:
+        return None
+    return round(wrap) if abs(wrap - round(wrap)) <= 0.2 * usual and round(wrap) else wrap
 
 
 def _check_rate(t: np.ndarray, where: str, kind: str) -> None:

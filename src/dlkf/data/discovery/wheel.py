@@ -4,6 +4,9 @@ Both speeds lie on a grid of half a second and are correlated over all lags at w
 between the steps is that of the least sum of squares of scale · wheel(t − lag) − GNSS(t), without outliers (slip,
 damaged speeds) and where the wheel has samples near, its 1σ from the residuals over the accelerations:
 σ² = s² / Σ (dv/dt)².
+
+A receiver's speed may be seconds late. The IMU shows that: the changes of the wheel's speed in a second are correlated
+with the integral of the forward acceleration, both without what varies slowly (hills).
 """
 
 from __future__ import annotations
@@ -23,6 +26,9 @@ MOVING = 2.0  # m/s
 LEAST_ALIKE, LEAST_GAIN = 0.9, 15.0
 IMPOSSIBLE = 3.0  # times the largest speed of GNSS, by what both have in their faster fifth: marks, damage
 OUTLYING, LEAST_RESIDUAL = 5.0, 0.05  # median residuals; of the mean speed at least
+FORCE_STEP_S, FORCE_REACH_S = 0.1, 4.0  # of the search against the IMU
+CHANGE_S, SLOW_S = 1.0, 20.0  # of a change of speed; of the mean that is taken off
+FORCE_ALIKE = 0.8  # correlation
 WHITE_S = 1.0  # residuals of a receiver's speed are alike over so long
 
 
@@ -60,6 +66,41 @@ def find_wheel(t: Floats, speed: Floats, gnss: Motion) -> Wheel | None:
     rival = np.where(np.abs(lags - lags[best]) > NEIGHBOUR_S, gain, -np.inf).max()
     clear = alike[best] > LEAST_ALIKE and gain[best] - rival > LEAST_GAIN
     return _between(t, speed, gnss, float(lags[best]), bool(clear))
+
+
+def find_force_lag(t: Floats, speed: Floats, imu_t: Floats, forward: Floats) -> tuple[float, float] | None:
+    """Seconds to be added to the wheel's stamps ``t`` to give those of the IMU's ``forward`` acceleration [m/s²], and
+    the correlation there; None where nothing agrees."""
+    good = np.isfinite(speed)
+    t, speed = t[good], np.abs(speed[good])
+    if len(t) < 20 or len(imu_t) < 20:
+        return None
+    margin = FORCE_REACH_S + CHANGE_S
+    grid = np.arange(max(t[0], imu_t[0]) + margin, min(t[-1], imu_t[-1]) - margin, FORCE_STEP_S)
+    if len(grid) * FORCE_STEP_S < LEAST_S:
+        return None
+    gained = np.cumsum(forward * np.diff(imu_t, prepend=imu_t[0]))
+    near = _is_near(t, grid) & _is_near(imu_t, grid)
+    force = _change(imu_t, gained, grid, near)
+    lags = np.arange(-FORCE_REACH_S, FORCE_REACH_S + FORCE_STEP_S / 2, FORCE_STEP_S)
+    alike = np.array([_correlate(_change(t + lag, speed, grid, near), force) for lag in lags])
+    best = int(alike.argmax())
+    if alike[best] < FORCE_ALIKE or not 0 < best < len(lags) - 1:
+        return None
+    return float(lags[best] + FORCE_STEP_S * find_peak(alike[best - 1 : best + 2])), float(alike[best])
+
+
+def _change(t: Floats, v: Floats, grid: Floats, known: np.ndarray) -> Floats:
+    """Changes of a speed around each time of the grid, without their mean over ``SLOW_S``; 0 where not ``known``."""
+    change = np.interp(grid + CHANGE_S / 2, t, v) - np.interp(grid - CHANGE_S / 2, t, v)
+    change = np.where(known, change, 0.0)
+    width = round(SLOW_S / FORCE_STEP_S)
+    return np.where(known, change - np.convolve(change, np.ones(width) / width, mode="same"), 0.0)
+
+
+def _correlate(one: Floats, other: Floats) -> float:
+    size = float(np.linalg.norm(one) * np.linalg.norm(other))
+    return float(one @ other) / size if size > 0 else 0.0
 
 
 def _resample(t: Floats, v: Floats) -> tuple[Floats, Floats]:

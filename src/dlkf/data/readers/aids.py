@@ -14,7 +14,7 @@ from dlkf.base.angles import wrap_angle
 from dlkf.base.errors import InputError
 from dlkf.data.discovery.clock import describe_offset
 from dlkf.data.discovery.motion import Motion, find_motion
-from dlkf.data.discovery.wheel import Wheel, find_wheel
+from dlkf.data.discovery.wheel import Wheel, find_force_lag, find_wheel
 from dlkf.data.limits import FASTEST_M_S
 from dlkf.data.readers import units
 from dlkf.data.readers.counters import count_rates
@@ -27,6 +27,7 @@ TURNS = {"rpm": 1 / 60, "turns": 1.0}  # turns (a second), with radius_m
 COUNTS = ("ticks", "turns", "m")  # what has been gained since the beginning; its rate is the speed
 UNKNOWN = -1  # of a column that has no other number below zero
 MOST_BEYOND = 0.05  # of a wheel's rows, faster than any car: more are of another unit
+LATE_S = 0.3  # by which the speed of GNSS is seen to differ from the IMU
 NEAR = 0.15  # of a wheel's scale from a known unit: tyres differ by some per cent
 
 
@@ -39,17 +40,23 @@ def aid_frame(name: str, mapped: Mapped, t: np.ndarray) -> pd.DataFrame:
 
 
 def read_aids(
-    mapped: Mapping[str, Mapped], zero: int, gnss: Mapped | None, fixes: pd.DataFrame | None, where: str
+    mapped: Mapping[str, Mapped],
+    zero: int,
+    imu: pd.DataFrame,
+    gnss: Mapped | None,
+    fixes: pd.DataFrame | None,
+    where: str,
 ) -> tuple[dict[str, pd.DataFrame], dict[str, Any], list[str]]:
     """Tables, specs without ``auto``, and what was found, of the aids of a drive that counts from the second ``zero``.
 
     ``gnss`` and ``fixes`` are the fixes' mapping and table on the drive's clock, by which a wheel's clock and unit are
-    found. InputError where they are not clear.
+    found; ``imu`` is that of the samples, by which the speed of the fixes is checked. InputError where they are not
+    clear.
     """
     frames, specs, notes = {}, {}, []
     moved = None if fixes is None or len(fixes) < 3 else find_motion(fixes[usable_fixes(fixes)])
     for name, part in mapped.items():
-        spec, found = _settle_auto(name, part, zero, gnss, moved, f"{where}: {part.table.path.name}")
+        spec, found = _settle_auto(name, part, zero, imu, gnss, moved, f"{where}: {part.table.path.name}")
         done = replace(part, spec=spec)
         frames[name], specs[name] = aid_frame(name, done, _times(done, zero)), spec
         if name == "speed":
@@ -79,7 +86,7 @@ def _times(mapped: Mapped, zero: int) -> np.ndarray:
 
 
 def _settle_auto(
-    name: str, mapped: Mapped, zero: int, gnss: Mapped | None, moved: Motion | None, where: str
+    name: str, mapped: Mapped, zero: int, imu: pd.DataFrame, gnss: Mapped | None, moved: Motion | None, where: str
 ) -> tuple[dict[str, Any], list[str]]:
     """Offset and unit that are left ``auto``: of a table beside the fixes as those have it, of a wheel by its speed."""
     spec: dict[str, Any] = copy.deepcopy(dict(mapped.spec))
@@ -110,14 +117,26 @@ def _settle_auto(
             "reader.speed.time.offset_s and reader.speed.value.unit, or leave it out with reader.speed.file=null"
         )
     if time.get("offset_s") == AUTO:
-        found = 0.0 if abs(wheel.lag_s) < 3 * wheel.lag_std else round(wheel.lag_s, 4)
-        time["offset_s"] = found
-        detail = f"{wheel.lag_s:+.3f} ± {wheel.lag_std:.3f} s, speeds agree to {wheel.alike:.3f} of 1"
-        notes.append(f"found reader.speed.time.offset_s={found}  ({detail}{describe_offset(wheel.lag_s)})")
+        time["offset_s"], detail = _offset(wheel, raw, imu)
+        notes.append(f"found reader.speed.time.offset_s={time['offset_s']}  ({detail})")
     if value.get("unit") == AUTO:
         value["unit"], detail = _unit(wheel, _counts(neutral))
         notes.append(f"found reader.speed.value.unit={value['unit']}  ({detail})")
     return spec, notes
+
+
+def _offset(wheel: Wheel, raw: pd.DataFrame, imu: pd.DataFrame) -> tuple[float, str]:
+    """The offset by GNSS; where the IMU shows that the speed of GNSS is early or late, that by the IMU."""
+    found = 0.0 if abs(wheel.lag_s) < 3 * wheel.lag_std else round(wheel.lag_s, 4)
+    by_gnss = f"{wheel.lag_s:+.3f} ± {wheel.lag_std:.3f} s, speeds agree to {wheel.alike:.3f} of 1"
+    t, speed = raw["t"].to_numpy() + wheel.lag_s, wheel.scale * raw["speed"].to_numpy()
+    force = find_force_lag(t, speed, imu["t"].to_numpy(), imu["accel_x"].to_numpy())
+    if force is None or abs(force[0]) < LATE_S:
+        return found, by_gnss + describe_offset(wheel.lag_s)
+    late = f"that speed is {abs(force[0]):.1f} s {'late' if force[0] < 0 else 'early'}"
+    by_imu = f"by the IMU's forward acceleration, which agrees to {force[1]:.2f} of 1"
+    by_gnss += describe_offset(wheel.lag_s)
+    return round(wheel.lag_s + force[0], 2), f"{by_imu}; by the speed of GNSS {by_gnss}: {late}"
 
 
 def _unit(wheel: Wheel, counts: bool) -> tuple[str | float, str]:

@@ -118,7 +118,10 @@ class AutoReader:
                 detail.append(f"found velocities in {more.get('table') or more['file']}")
         if (specs["gnss"].get("time") or {}).get("offset_s") is None and specs["gnss"].get("file"):
             specs["gnss"]["time"]["offset_s"] = "auto"
-        if not specs["gnss"].get("file") and (foreign := _find_unread(within, only)):
+        without = "file" in self.known["gnss"] and self.known["gnss"]["file"] is None
+        if not specs["gnss"].get("file") and not without:
+            _refuse_lost(within, folder)
+        if not specs["gnss"].get("file") and not without and (foreign := _find_unread(within, only)):
             if foreign.held.startswith(DAMAGED):
                 raise InputError(f"{foreign.path}: {foreign.held}; or take it away where this is a log at rest")
             what = "it is empty" if foreign.held == "empty" else foreign.held
@@ -171,6 +174,11 @@ class AutoReader:
                 )
             have = ", ".join(o.name for o in offers if kind in o.specs) or "no file"
             raise InputError(f"{folder}: reader.{kind}.file={file}: no such file here; {kind.upper()} found in {have}")
+        if kind == "gnss" and (named := _list_named(self.known[kind])):
+            have = [o.name for o in offers if kind in o.specs]
+            why = "; ".join(one.lost for one in within if one.lost)
+            where = f"; GNSS found in {', '.join(have)}" if have else ""
+            raise InputError(f"{folder}: no GNSS found for {' '.join(named)}{why and f' ({why})'}{where}")
         if kind == "imu":
             remedy = "give the folder that holds the IMU's file too, or name both" if only is not None else (
                 "name the reader and its columns (reader=csv reader.imu.file=… 'reader.imu.accel.columns=[…]' …)"
@@ -248,6 +256,22 @@ def _join_sensors(offers: list[Offer]) -> list[Offer]:
     specs = leave_open({"imu": {**accel.specs["accel"], "gyro": {**rate["gyro"], **source}}})
     detail = f"{accel.detail}, and {gyro.name} with {', '.join(rate['gyro']['columns'])}"
     return [Offer(accel.path, detail, specs, table=accel.table)]
+
+
+def _refuse_lost(within: Iterable[Contents], folder: Path) -> None:
+    """InputError for positions of which no fixes can be made: without them the drive would be a log at rest."""
+    if lost := next((one for one in within if one.lost), None):
+        raise InputError(
+            f"{folder}: no fixes found in {lost.path.name} ({lost.lost}); name their columns (reader.gnss.…), or "
+            "reader.gnss.file=null where this is a log at rest"
+        )
+
+
+def _list_named(gnss: Mapping[str, Any]) -> list[str]:
+    """The table and the columns that settings of fixes name."""
+    named = [] if gnss.get("table") is None else [f"reader.gnss.table={gnss['table']}"]
+    columns = {key: spec.get("columns") for key, spec in gnss.items() if isinstance(spec, Mapping)}
+    return named + [f"reader.gnss.{key}.columns=[{', '.join(map(str, c))}]" for key, c in columns.items() if c]
 
 
 def _settle_at_rest(imu: dict[str, Any]) -> list[str]:

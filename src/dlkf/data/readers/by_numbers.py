@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ import pandas as pd
 from dlkf.base.angles import wrap_angle
 from dlkf.data.discovery.units import time_unit
 from dlkf.data.limits import EARTH_M
-from dlkf.data.readers import stamps, units
+from dlkf.data.readers import stamps, vocabulary
 from dlkf.data.readers.frames import LogTable
 from dlkf.navigation.earth import STANDARD_GRAVITY as G
 
@@ -27,16 +28,18 @@ SMALL_M = 100.0  # standard deviations are smaller
 def imu_spec(frame: pd.DataFrame) -> Spec | None:
     """Stamps rise, three neighbours have gravity's size, three beside them are rates."""
     values = frame.to_numpy(float)
-    rising = [k for k in range(values.shape[1]) if np.all(np.diff(values[:, k]) > 0)]
-    if not rising or values.shape[1] < 7:
+    time = stamps.find_pair(frame, 0.21, 2e-4) or _rising(frame)
+    if time is None or values.shape[1] < 7:
         return None
-    fits = [(k, unit) for k in rising if (unit := time_unit(values[:, k], 0.21, 2e-4)) is not None]
-    fits = [(k, u) for k, u in fits if not np.all(np.diff(values[:, k]) == 1) or len(fits) == 1]
-    if not fits:
+    t = stamps.read_seconds(LogTable(frame, Path()), time)
+    if t is None:
         return None
-    column, unit = fits[0]
-    step = float(np.median(np.diff(values[:, column]))) / units.TIME[unit]
+    step = float(np.median(np.diff(t)))
+    last = time["column"][-1] if isinstance(time["column"], list) else time["column"]
+    column = [str(name) for name in frame.columns].index(last)
     starts = [k for k in range(values.shape[1] - 2) if not {column} & {k, k + 1, k + 2}]
+    ends = "".join(vocabulary.words(str(name))[-1:] or "-" for name in frame.columns)
+    starts = [k for k in starts if ends[k : k + 3] == "xyz"] or starts
 
     def apart(k: int) -> tuple[float, bool]:
         size = np.linalg.norm(values[:, k : k + 3], axis=1)
@@ -55,7 +58,16 @@ def imu_spec(frame: pd.DataFrame) -> Spec | None:
         return None
     triads = {"accel": accel, "gyro": beside[0]}
     out: Spec = {key: {"columns": [str(frame.columns[k + j]) for j in range(3)]} for key, k in triads.items()}
-    return {"time": {"column": str(frame.columns[column]), "unit": unit}, "increments": bool(apart(accel)[1]), **out}
+    return {"time": time, "increments": bool(apart(accel)[1]), **out}
+
+
+def _rising(frame: pd.DataFrame) -> Spec | None:
+    """Stamps in a column that rises with every row by an IMU's steps; one that counts rows is the last choice."""
+    values = {str(name): frame[name].to_numpy(float) for name in frame.columns}
+    rising = {name: x for name, x in values.items() if np.all(np.diff(x) > 0)}
+    fits = {name: unit for name, x in rising.items() if (unit := time_unit(x, 0.21, 2e-4)) is not None}
+    clocks = [name for name in fits if not np.all(np.diff(values[name]) == 1) or len(fits) == 1]
+    return {"column": clocks[0], "unit": fits[clocks[0]]} if clocks else None
 
 
 def gnss_spec(table: LogTable) -> Spec | None:

@@ -143,7 +143,9 @@ class LogReader:
         for kind, part in mapped.items():
             check_time(t[kind], f"drive {name}, {part.table.path.name}", kind, part.name_row)
         others = {kind: part for kind, part in every.items() if kind not in FRAMES}
-        aids, specs, of_aids = read_aids(others, zero, mapped.get("gnss"), frames.get("gnss"), f"drive {name}")
+        aids, specs, of_aids = read_aids(
+            others, zero, frames["imu"], mapped.get("gnss"), frames.get("gnss"), f"drive {name}"
+        )
         if self.wanted or of_aids:
             assert not isinstance(arm, str)  # auto is wanted, and found above
             named = {"time_zero": self.time_zero, "group": self.group, "lever_arm_m": list(arm), "meta": self.meta}

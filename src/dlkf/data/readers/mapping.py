@@ -13,7 +13,7 @@ import pandas as pd
 
 from dlkf.base.errors import InputError, did_you_mean, list_some
 from dlkf.data.bursts import follow_at_once
-from dlkf.data.readers import units
+from dlkf.data.readers import units, vocabulary
 from dlkf.data.readers.frames import LogTable
 
 Spec = Mapping[str, Any]
@@ -190,7 +190,7 @@ class Mapped:
             elif wraps_s is not None:
                 raise InputError(f"{where}.wraps_s={wraps_s}: stamps with a date do not start again; leave it out")
         else:
-            values = self.column(name[-1] if isinstance(name, list) else name, nan=False)
+            values, unit = self._numbers(name, unit)
         day = None if time.get("day") is None else str(time["day"])
         if unit == units.HHMMSS:
             values, unit = units.seconds_of_day(values), "s"
@@ -198,12 +198,39 @@ class Mapped:
         if unit in units.DAYS:
             values, unit = (values - units.DAYS[unit]) * 86_400.0, "s"
         if wraps_s is not None:
-            values = units.unwrap_stamps(values, float(wraps_s) * units.TIME.get(unit, 1))
+            values = units.unwrap_stamps(values, float(wraps_s), units.TIME.get(unit, 1))
         week = self.column(time["week"], nan=False) if time.get("week") is not None else None
         if time.get("week_number") is not None:
             week = np.full(len(self), int(time["week_number"]))
         order = None if time.get("order") is None else str(time["order"])
         return units.seconds(values, unit, week, time.get("clock"), f"{self.table.path}, {where}", day, order)
+
+    def first_count_s(self) -> float:
+        """The first row's stamp [s] as the table has it, of numbers."""
+        values, unit = self._numbers(self.time["column"], self.time.get("unit") or "s")
+        return float(values[0]) / units.TIME[unit]
+
+    def _numbers(self, name: Any, unit: str) -> tuple[np.ndarray, str]:
+        """A column of stamps and its unit, the last of several; of two columns of numbers (not of hhmmss) the sum of
+        whole seconds and of the rest, in ``unit`` or in that of its name."""
+        names = name if isinstance(name, list) else [name]
+        if len(names) != 2 or unit == units.HHMMSS or not pd.api.types.is_numeric_dtype(self._cells(names[0])):
+            return self.column(names[-1], nan=False), unit
+        (first, second), where = names, f"reader.{self.kind}.time"
+        of_rest = vocabulary.find_fraction(str(second)) if unit == "s" else unit
+        if of_rest is None:
+            raise InputError(
+                f"{where}.unit is {unit}, must be ms, us or ns: of {second!r}, beside the seconds in {first!r}"
+            )
+        whole, rest = (self.column(one, nan=False) for one in (first, second))
+        ticks = units.factor(of_rest, units.TIME, f"{where}.unit")
+        if len(bad := np.flatnonzero(whole % 1 != 0)):
+            self.fail(int(bad[0]), first, f"is {whole[bad[0]]}, must be whole seconds beside {second!r}")
+        if len(bad := np.flatnonzero((rest < 0) | (rest >= ticks))):
+            limit = f"must be below {ticks:.0f} ({of_rest} beside the seconds in {first!r})"
+            self.fail(int(bad[0]), second, f"is {rest[bad[0]]}, {limit}")
+        billion = units.TIME["ns"]
+        return whole.astype(np.int64) * billion + np.round(rest * (billion / ticks)).astype(np.int64), "ns"
 
     def scale(self, key: str, table: Mapping[str, float], name: str = "unit") -> float:
         """SI per unit of an entry; the first unit of the table if the entry has none."""
@@ -260,12 +287,13 @@ class Mapped:
 
 def select_rows(mapped: Mapped) -> Mapped:
     """The rows that ``rows`` chooses: ``{column: …, is: [...]}``; ``filled``: those whose columns are not empty;
-    ``changed``: of these, those whose position is not that of the row before."""
+    ``changed``: of these, those whose position is not that of the row before; ``once``: those that do not have
+    the stamp and all columns of the row before."""
     rows = mapped.spec.get("rows")
     where = f"reader.{mapped.kind}.rows"
     if rows is None:
         return mapped
-    if rows in ("filled", "changed"):
+    if rows in ("filled", "changed", "once"):
         entries = ("accel", "gyro", "position", "pressure", "height")
         names = {str(n) for key in entries for n in _names(mapped, key)}
         time = mapped.time.get("column")
@@ -278,11 +306,14 @@ def select_rows(mapped: Mapped) -> Mapped:
         if rows == "changed":
             place = frame.loc[keep, [c for c in frame.columns if c in {str(n) for n in _names(mapped, "position")}]]
             keep[keep] = (place != place.shift()).any(axis=1).to_numpy()
+        elif rows == "once":
+            cells = frame.loc[keep, [c for c in frame.columns if c in names or c in some]]
+            keep[keep] = (cells != cells.shift()).any(axis=1).to_numpy()
     elif isinstance(rows, Mapping) and set(rows) == {"column", "is"}:
         values = rows["is"] if isinstance(rows["is"], (list, tuple)) else [rows["is"]]
         keep = mapped.texts(rows["column"]).isin([str(v) for v in values]).to_numpy()
     else:
-        raise InputError(f"{where} is {rows!r}, must be filled, changed or {{column: …, is: [...]}}")
+        raise InputError(f"{where} is {rows!r}, must be filled, changed, once or {{column: …, is: [...]}}")
     if not keep.any():
         raise InputError(f"{mapped.table.path}: no row is left by {where}={rows}; set it right")
     return mapped.rows(keep)

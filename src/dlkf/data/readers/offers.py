@@ -12,7 +12,7 @@ from typing import Any
 
 from dlkf.base.config import read_preset
 from dlkf.base.errors import InputError
-from dlkf.data.readers import formats, recognise, vocabulary
+from dlkf.data.readers import formats, recognise, stamps, vocabulary
 from dlkf.data.readers.formats import autopilot, matlab, nmea, rosbag, text, ubx
 from dlkf.data.readers.frames import LogTable
 
@@ -57,11 +57,13 @@ class Offer:
 
 @dataclass(frozen=True)
 class Contents:
-    """What a file gives; ``held`` describes its content, for a line that refuses it."""
+    """What a file gives; ``held`` describes its content, for a line that refuses it, ``lost`` a table in it with
+    positions of which no fixes can be made."""
 
     path: Path
     offers: list[Offer] = field(default_factory=list)
     held: str = ""
+    lost: str = ""
 
 
 def recognise_file(path: Path, known: Known = MappingProxyType({})) -> Contents:
@@ -96,7 +98,7 @@ def recognise_file(path: Path, known: Known = MappingProxyType({})) -> Contents:
     found = _offer_table(path, name, table, options, None, known)
     if not found:
         return Contents(path, held=recognise.describe_missing(table))
-    return Contents(path, found, _describe_lone_sensor(table, found[0]))
+    return Contents(path, found, _describe_lone_sensor(table, found[0]), _describe_lost_fixes(table, found))
 
 
 def matches(path: Path, file: Any) -> bool:
@@ -111,6 +113,15 @@ def _describe_lone_sensor(table: LogTable, offer: Offer) -> str:
     if len(alone) != 1 or "imu" in offer.specs:
         return ""
     return f"{offer.detail}, without {recognise.COUNTERPARTS[alone.pop()]}"
+
+
+def _describe_lost_fixes(table: LogTable, offers: list[Offer]) -> str:
+    """What a table with a latitude has and lacks, where none of its offers has fixes; else empty."""
+    frame = recognise.convert_numbers(table).frame
+    names = [str(name) for name in frame.select_dtypes("number")]
+    if vocabulary.find_column(names, "lat") is None or any("gnss" in offer.specs for offer in offers):
+        return ""
+    return recognise.describe_missing(table)
 
 
 def _offer_preset(path: Path, name: str) -> Contents:
@@ -147,14 +158,15 @@ def _offer_matlab(path: Path, known: Known) -> Contents:
         return Contents(path, held=str(error).removeprefix(f"{path}: "))
     if all(mark in tables.get(kind, ()) for kind, mark in NAVEGO.items()):
         return _offer_preset(path, "navego")
-    found = [
-        offer
-        for name, frame in tables.items()
-        for offer in _offer_table(path, "matlab", LogTable(frame, path), {}, name, known)
-    ]
+    by_table = {
+        name: _offer_table(path, "matlab", LogTable(frame, path), {}, name, known) for name, frame in tables.items()
+    }
+    lost = {name: _describe_lost_fixes(LogTable(tables[name], path), offers) for name, offers in by_table.items()}
+    found = [offer for offers in by_table.values() for offer in offers]
     first = list(tables.items())[:4]
     said = "; ".join(f"{name}: {recognise.describe_missing(LogTable(frame, path))}" for name, frame in first)
-    return Contents(path, found, said or "no matrix and no structure of vectors")
+    why = next((f"{name}: {text}" for name, text in lost.items() if text), "")
+    return Contents(path, found, said or "no matrix and no structure of vectors", why)
 
 
 def _offer_table(
@@ -162,10 +174,14 @@ def _offer_table(
 ) -> list[Offer]:
     table = recognise.convert_numbers(table)
     named = {kind: recognise.named_columns(table, spec) for kind, spec in known.items()}
-    imu, gnss = recognise.imu_spec(table, named.get("imu", {})), None
+    times = {kind: spec.get("time") or {} for kind, spec in known.items()}
+    imu, gnss = recognise.imu_spec(table, named.get("imu", {}), times.get("imu", {})), None
     place = named.get("gnss", {})
     if imu is None or "position" in place or vocabulary.find_column(map(str, table.frame.columns), "lat"):
-        gnss = recognise.gnss_spec(table, place)
+        gnss = recognise.gnss_spec(table, place, times.get("gnss", {}))
+    local = stamps.find_zone_s(table, imu.spec["time"], gnss.spec["time"]) if imu and gnss else 0
+    if local and imu is not None:
+        imu.spec["time"]["offset_s"] = -local
     source: dict[str, Any] = {"format": name, "file": path.name, "text": options}
     source |= {"table": part} if part is not None else {}
     time = next((one.spec["time"] for one in (imu, gnss) if one is not None), None)
@@ -180,6 +196,8 @@ def _offer_table(
     specs = {kind: {**source, **one.spec} for kind, one in found.items()}
     columns = ", ".join(dict.fromkeys(str(c) for spec in (specs or aids).values() for c in _columns(spec)))
     notes = tuple(note for one in found.values() for note in one.notes)
+    if local:
+        notes += (f"dates of {path.name}: {local / 3600:+g} h from UTC by the fixes' stamps, so they are local time",)
     specs = leave_open(specs | aids, stated=True)
     refusal = "" if gnss is None else gnss.refusal
     return [Offer(path, f"{name} with {columns}", specs, notes, part, refusal)] if specs else []
@@ -271,7 +289,8 @@ def leave_open(specs: Mapping[str, Any], stated: bool = False) -> dict[str, dict
                 unit = spec[key].get("unit") if stated else None
                 spec[key] = {**spec[key], "unit": unit or "auto", "axes": "auto"}
         elif kind not in ("accel", "gyro"):
-            spec["time"] = {**spec["time"], "offset_s": "auto"}
+            known = spec["time"].get("offset_s") if stated else None  # of samples' dates in local time
+            spec["time"] = {**spec["time"], "offset_s": "auto" if known is None else known}
         if kind == "gnss":
             spec["time"]["drift_ppm"] = "auto"
             spec["velocity"] = {**(spec.get("velocity") or {}), "unit": "auto"}

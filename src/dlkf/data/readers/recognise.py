@@ -49,14 +49,16 @@ def named_columns(table: LogTable, known: Mapping[str, Any]) -> dict[str, list[s
     return {key: [str(c) for c in columns] for key, columns in entries.items() if {*map(str, columns)} <= {*names}}
 
 
-def imu_spec(table: LogTable, named: Mapping[str, list[str]] = NONE_NAMED) -> Recognised | None:
+def imu_spec(
+    table: LogTable, named: Mapping[str, list[str]] = NONE_NAMED, named_time: Mapping[str, Any] = stamps.NONE_NAMED
+) -> Recognised | None:
     """The mapping of a table that holds an IMU, in the columns that are ``named`` by entry (:func:`named_columns`) or
-    known by their names or numbers; None if it does not."""
+    known by their names or numbers, at the stamps of the settings ``named_time``; None if it does not."""
     frame, names = _select_numeric(table)
     triads = vocabulary.find_triads(names) | {key: named[key] for key in vocabulary.SENSORS if key in named}
     if len(triads) == 2:
         known = frame[triads["accel"] + triads["gyro"]].notna().all(axis=1)
-        time = stamps.time_spec(table, known, SLOWEST_IMU_S, FASTEST_IMU_S)
+        time = stamps.time_spec(table, known, SLOWEST_IMU_S, FASTEST_IMU_S, named_time)
         if time is None:
             return None
         sensors = {key: {"columns": columns} for key, columns in triads.items()}
@@ -68,6 +70,7 @@ def imu_spec(table: LogTable, named: Mapping[str, list[str]] = NONE_NAMED) -> Re
     spec = by_numbers.imu_spec(frame)
     if spec is None:
         return None
+    spec |= _find_named_time(table, SLOWEST_IMU_S, FASTEST_IMU_S, named_time)
     columns = [*spec["accel"]["columns"], *spec["gyro"]["columns"]]
     notes = () if _are_unnamed(names) else (f"took {', '.join(columns[:3])} for the accelerometers by gravity, "
                                         f"{', '.join(columns[3:])} for the gyroscopes",)  # fmt: skip
@@ -109,8 +112,11 @@ def sensor_spec(table: LogTable, called: str) -> dict[str, Spec]:
     return {}
 
 
-def gnss_spec(table: LogTable, named: Mapping[str, list[str]] = NONE_NAMED) -> Recognised | None:
-    """The mapping of a table that holds fixes, in the columns ``named`` as an IMU's; None if it does not."""
+def gnss_spec(
+    table: LogTable, named: Mapping[str, list[str]] = NONE_NAMED, named_time: Mapping[str, Any] = stamps.NONE_NAMED
+) -> Recognised | None:
+    """The mapping of a table that holds fixes, in the columns and at the stamps that are named as an IMU's; None if it
+    does not."""
     frame, names = _select_numeric(table)
     receiver = choose_receiver(frame, [str(n) for n in table.frame.columns], named.get("position", ()))
     found = receiver.found
@@ -121,15 +127,18 @@ def gnss_spec(table: LogTable, named: Mapping[str, list[str]] = NONE_NAMED) -> R
         spec = by_numbers.gnss_spec(table)
         if spec is None:
             return None
+        spec |= _find_named_time(table, SLOWEST_FIX_S, FASTEST_FIX_S, named_time)
         columns = ", ".join(spec["position"]["columns"])
         more = "; found others by the way between the positions" if spec["velocity"].get("columns") else ""
         note = f"took {columns} for latitude, longitude, height{more}"
         return Recognised(spec, () if _are_unnamed(names) else (note,))
     known = frame[[lat, lon]].notna().all(axis=1)
-    held = _find_repeated(frame[known], [lat, lon])
-    if held is not None:
-        known[known] = ~held
-    time = stamps.time_spec(table, known, SLOWEST_FIX_S, FASTEST_FIX_S)
+    clock = stamps.find_named(table.frame, named_time)
+    if not clock and (clock := vocabulary.match_columns(names, vocabulary.SINCE_1970)[:1]):
+        named_time = {**named_time, "column": clock[0]}
+    rows, held = stamps.find_repeated(table.frame[known], [lat, lon], clock)
+    known[known] = ~held
+    time = stamps.time_spec(table, known, SLOWEST_FIX_S, FASTEST_FIX_S, named_time)
     if time is None or height is None:
         return None
     position: Spec = {"columns": [lat, lon, height], "unit": _angle_unit(frame, found)}
@@ -159,10 +168,19 @@ def gnss_spec(table: LogTable, named: Mapping[str, list[str]] = NONE_NAMED) -> R
         spec, note = _dilutions(table.frame[known], found, quality)
         out |= spec
         notes.append(note)
-    if held is not None:
-        out["rows"] = "changed"
-        notes.append(f"took {int(known.sum())} of {len(held)} rows for fixes: the others repeat the position before")
+    if rows is not None:
+        out["rows"] = rows
+        what = {"changed": "position", "once": "stamp and position"}[rows]
+        notes.append(f"took {int(known.sum())} of {len(held)} rows for fixes: the others repeat the {what} before")
     return Recognised(out, (*more, *notes), receiver.refusal)
+
+
+def _find_named_time(table: LogTable, slowest: float, fastest: float, named: Mapping[str, Any]) -> Spec:
+    """The entry ``time`` of a mapping by the settings; empty where they name no column of the table."""
+    if not stamps.find_named(table.frame, named):
+        return {}
+    time = stamps.time_spec(table, pd.Series(True, table.frame.index), slowest, fastest, named)
+    return {} if time is None else {"time": time}
 
 
 def _velocity_by_numbers(table: LogTable, frame: pd.DataFrame, time: Spec, position: Spec) -> Spec:
@@ -185,15 +203,6 @@ def _hemispheres(frame: pd.DataFrame) -> list[str] | None:
     return [side for side in sides if side is not None] if all(sides) and len(frame) else None
 
 
-def _find_repeated(frame: pd.DataFrame, place: list[str]) -> pd.Series | None:
-    """Rows that repeat the position before, in a table of IMU samples beside which most do; else None."""
-    names = [str(c) for c in frame.columns]
-    if len(frame) < 10 or not vocabulary.find_triads(names):
-        return None
-    same = (frame[place] == frame[place].shift()).all(axis=1)
-    return same if same.mean() > 0.5 else None
-
-
 def aid_specs(table: LogTable, called: str, time: Spec | None = None, taken: Collection[str] = ()) -> dict[str, Spec]:
     """The mapping of every aid in a table: wheel speed, heading and barometer by the columns' names, a pressure by its
     size too.
@@ -209,7 +218,8 @@ def aid_specs(table: LogTable, called: str, time: Spec | None = None, taken: Col
     if wheels:
         found["speed"] = {"value": _wheel_value(numbers, wheels)}
     headings = [n for n in names if vocabulary.has(n, vocabulary.HEADING)]
-    if not headings and not places and vocabulary.has(called, rf"{vocabulary.HEADING}|^heading$"):
+    compass = any(vocabulary.has(n, vocabulary.COMPASS) for n in names)
+    if not headings and not places and not compass and vocabulary.has(called, rf"{vocabulary.HEADING}|^heading$"):
         headings = [n for n in names if n == vocabulary.find_column([n], "course")]
     if headings:
         degrees = float(np.nanmax(np.abs(numbers[headings[0]]))) > 2 * np.pi + 0.01
@@ -225,7 +235,7 @@ def aid_specs(table: LogTable, called: str, time: Spec | None = None, taken: Col
         column = (spec.get("value") or spec["pressure"])["columns"] or spec["height"]["columns"]
         known = time or stamps.time_spec(table, numbers[column[0]].notna(), SLOWEST_AID_S, FASTEST_AID_S)
         if known is not None:
-            out[name] = {"time": {**known, "offset_s": "auto"}, "rows": "filled", **spec}
+            out[name] = {"time": {"offset_s": "auto", **known}, "rows": "filled", **spec}
     return out
 
 

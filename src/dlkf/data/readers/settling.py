@@ -18,7 +18,7 @@ from dlkf.data.discovery.findings import Finding, Sure, discover, find_accel_uni
 from dlkf.data.discovery.motion import find_motion
 from dlkf.data.discovery.units import CLIMBS_ALIKE, compare_climbs, nearest_unit, speed_factor
 from dlkf.data.limits import within_full_scale
-from dlkf.data.readers import units
+from dlkf.data.readers import units, vocabulary
 from dlkf.data.readers.contract import gnss_frame, imu_frame, positions
 from dlkf.data.readers.mapping import Mapped
 from dlkf.data.readers.sharing import read_value, set_value, write_value
@@ -47,6 +47,7 @@ HIGHEST_M = 9000.0  # of a road
 SURE_SCALE = 0.05  # 1σ of a unit by number that may be given so
 METRIC = ("m/s", "cm/s", "mm/s")
 MOST_TURN = (0.999, 10.0)  # share of the rates; rad/s that no car turns by
+STATED_SIGMA = 5.0  # by which turns contradict a unit that a name states
 LEAST_GRAVITY = 0.5  # of the mean force: the length of the mean; with gravity in it nearly 1
 
 
@@ -126,6 +127,7 @@ def settle(
         increments=bool(mapped["imu"].spec.get("increments")),
         drift_given="gnss.time.drift_ppm" not in wanted and read_value(specs, "gnss.time.drift_ppm") is not None,
     )
+    found = [_take_stated_unit(one, mapped["imu"].spec) for one in found]
     _refuse_doubt(found, wanted, where, t)
     for name in wanted & set(NEUTRAL):
         value = copy.deepcopy(find_value(found, "imu.axes" if name.endswith("axes") else name))
@@ -134,6 +136,16 @@ def settle(
     lever = find_value(found, "lever_arm_m") if "lever_arm_m" in wanted else arm
     x, y, z = (float(a) for a in lever)
     return specs, (x, y, z), _describe_findings(found, wanted)
+
+
+def _take_stated_unit(finding: Finding, imu: Mapping[str, Any]) -> Finding:
+    """The gyroscopes' unit in the names of their columns, where the turns leave it open and do not contradict."""
+    stated = vocabulary.find_unit(str((imu["gyro"].get("columns") or [""])[0]))
+    if finding.setting != "imu.gyro.unit" or finding.sure or imu.get("increments") or stated not in units.RATE:
+        return finding
+    if is_number(finding.value) and abs(finding.value - units.RATE[stated]) > STATED_SIGMA * finding.std:
+        return finding
+    return Finding(finding.setting, stated, True, f"as the columns' names state; {finding.detail}")
 
 
 def _leave_out_damage(imu: pd.DataFrame, wanted: set[str], increments: bool) -> pd.DataFrame:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -15,6 +18,7 @@ from dlkf.data.readers.frames import LogTable
 from dlkf.data.readers.mapping import TABULAR, Mapped
 
 Spec = dict[str, Any]
+NONE_NAMED: Mapping[str, Any] = MappingProxyType({})
 CALENDAR = r"^\s*(\d{4}[-/.]\d{1,2}[-/.]\d{1,2}|\d{1,2}-[A-Za-z]{3}-\d{4}|\d{1,2}[-/.]\d{1,2}[-/.]\d{4}"
 CALENDAR += r"|\d{1,2}[/.]\d{1,2}[/.]\d{2}|\d{8})"
 CALENDAR += r"[T ]+\d{1,2}:\d{2}"
@@ -24,20 +28,30 @@ NEWEST_UNIX = 2e9  # s: 2033; a stamp beyond it counts from no known epoch
 NAMED_ZONE = r"(?:Z|UTC|GMT|[+-]\d{2}:?\d{2})\s*$"
 QUARTER_S, LEAST_ZONE_S = 900, 3600  # time zones are whole quarters of an hour
 SWITCHED_ON_S = 1000.0  # a log that begins with less counts from its own beginning, which is nothing to report
+MOST_REPEATED = 0.5  # of the rows, which repeat the fix before where it is beside samples
 XSENS_TICK = "1e-4s"
 CLOCK_NAMES = {"gps": "GPS time", None: "of an unnamed clock"}  # of calendar texts; else UTC
 OLDEST_UNIX = 1.0e9  # s: 2001; no log of a car with an IMU of this kind is older
 
 
-def time_spec(table: LogTable, rows: pd.Series, slowest: float, fastest: float) -> Spec | None:
-    """The mapping's ``time`` for the rows of one kind, between which ``fastest`` to ``slowest`` seconds pass."""
+def time_spec(
+    table: LogTable, rows: pd.Series, slowest: float, fastest: float, named: Mapping[str, Any] = NONE_NAMED
+) -> Spec | None:
+    """The mapping's ``time`` for the rows of one kind, between which ``fastest`` to ``slowest`` seconds pass; of the
+    settings ``named`` by the user the column and the unit count."""
     frame = table.frame[rows]
     if frame.empty:
         return None
+    chosen = find_named(frame, named)
+    if chosen and named.get("unit") is not None:
+        return {"column": named["column"], "unit": named["unit"]}
+    frame = frame[chosen] if chosen else frame
     names = [str(c) for c in frame.columns]
-    called = vocabulary.match_columns(names, vocabulary.TIME)
+    called = chosen or vocabulary.match_columns(names, vocabulary.TIME)
     if (dated := _find_dates(frame, called, vocabulary.match_columns(names, vocabulary.DATE))) is not None:
         return dated
+    if (pair := find_pair(frame, slowest, fastest)) is not None:
+        return pair
     dates = [name for name in vocabulary.match_columns(names, vocabulary.DATE) if _counts_days(frame[name], slowest)]
     numbers = [name for name in (*called, *dates) if pd.api.types.is_numeric_dtype(frame[name])]
     column = numbers[0] if numbers else find_rising(frame)
@@ -62,6 +76,57 @@ def time_spec(table: LogTable, rows: pd.Series, slowest: float, fastest: float) 
         return spec | {"week": week}
     clock = choose_clock(column, float(np.nanmedian(values)) / units.TIME[unit])
     return spec | ({"clock": clock} if clock else {})
+
+
+def find_pair(frame: pd.DataFrame, slowest: float, fastest: float) -> Spec | None:
+    """Whole seconds in one column and the rest of them in another, as ROS has them; None where no two are such."""
+    pair = vocabulary.find_seconds(str(n) for n in frame if pd.api.types.is_numeric_dtype(frame[n]))
+    if pair is None:
+        return None
+    spec: Spec = {"column": [*pair], "unit": vocabulary.find_fraction(pair[1])}
+    t = read_seconds(LogTable(frame, Path(pair[0])), spec)
+    steps = np.empty(0) if t is None else np.diff(t)[np.diff(t) > 0]
+    if not len(steps) or not fastest <= np.median(steps) <= slowest:
+        return None
+    clock = choose_clock(pair[0], float(frame[pair[0]].median()))
+    return spec | ({"clock": clock} if clock else {})
+
+
+def find_named(frame: pd.DataFrame, named: Mapping[str, Any]) -> list[str]:
+    """The columns of the stamps that a user's settings name, where a table has them all; else none."""
+    column = named.get("column")
+    columns = [str(c) for c in (column if isinstance(column, (list, tuple)) else [column]) if c is not None]
+    return columns if {*columns} <= {*map(str, frame.columns)} else []
+
+
+def find_repeated(frame: pd.DataFrame, place: list[str], clock: list[str]) -> tuple[str | None, pd.Series]:
+    """Rows that repeat the fix before, and the setting ``rows`` that leaves them out, None where there are none: those
+    with its stamp too, of the columns ``clock`` or by name; beside samples of an IMU, whose stamps are others, most."""
+    names = [str(c) for c in frame.columns]
+    same = (frame[place] == frame[place].shift()).all(axis=1)
+    times = clock or vocabulary.match_columns(names, vocabulary.TIME)
+    again = same & (frame[times] == frame[times].shift()).all(axis=1) if times else same & False
+    if not vocabulary.find_triads(names):
+        return ("once" if again.any() else None), again
+    if len(frame) < 10 or same.mean() <= MOST_REPEATED:
+        return None, same & False
+    return ("once", again) if clock and again.mean() > MOST_REPEATED else ("changed", same)
+
+
+def find_zone_s(table: LogTable, imu: Spec, gnss: Spec) -> int:
+    """Time zone [s ahead of UTC] of the samples' calendar texts, by stamps of fixes in the same table in Unix time."""
+    both = [imu.get("column"), gnss.get("column")]
+    if imu.get("unit") != units.ISO or gnss.get("clock") != "unix" or not all(isinstance(one, str) for one in both):
+        return 0
+    rows = table.frame[both].notna().all(axis=1)
+    if not rows.any():
+        return 0
+    samples, fixes = (
+        Mapped(LogTable(table.frame[rows], table.path), {"time": time}, "imu").own_stamps()[0] for time in (imu, gnss)
+    )
+    ahead_s = float(np.median(samples - fixes))
+    zone_s = QUARTER_S * round(ahead_s / QUARTER_S)
+    return zone_s if LEAST_ZONE_S <= abs(zone_s) <= FARTHEST_ZONE_H * 3600 and abs(ahead_s - zone_s) < 40 else 0
 
 
 def _is_clock_face(values: np.ndarray, slowest: float) -> bool:
@@ -203,7 +268,7 @@ def _describe_epoch(part: Mapped, columns: list[str], setting: str) -> str | Non
 def _describe_count(part: Mapped, column: str, setting: str) -> str | None:
     """From when seconds in a column count, by their size."""
     unit, clock = part.time.get("unit") or "s", part.time.get("clock")
-    seconds = float(part.column(column, nan=False)[0]) / units.TIME[unit]
+    seconds = part.first_count_s()
     known = {"unix": "unix", "utc": "unix", "gps": "gps"}.get(str(clock)) or units.clock_by_size(seconds)
     if known is None:
         counter = unit == XSENS_TICK  # runs since the device was switched on

@@ -28,6 +28,7 @@ DAYS = {"datenum": 719_529, "excel": 25_569}  # day 0 of 1970 in MATLAB's datenu
 ISO = "iso"  # calendar texts: 2025-07-05T23:57:12.7Z, 2025/07/05 23:57:12.700
 CLOCKS = ("gps", "unix", "utc")
 OF_DAY = r"^\s*\d{1,2}:\d{2}(:\d{2}([.,]\d*)?)?\s*([AaPp][Mm])?\s*Z?\s*$"  # calendar texts without a date
+SKIPPED_S = 1.0  # of a counter that starts again each second the rows of that time may lack
 DAY_S, WEEK_S = 86_400, 604_800
 GPS_EPOCH_UNIX = 315_964_800  # 1980-01-06 in Unix seconds
 UNIX_SINCE, GPS_SINCE = 1.55e9, 3e8  # s; a Unix second after January 2019; a GPS second after 1989
@@ -148,11 +149,17 @@ def gps_seconds(unix: Any) -> Any:
     return unix - GPS_EPOCH_UNIX + leap_seconds(unix)
 
 
-def unwrap_stamps(values: np.ndarray, wrap: float) -> np.ndarray:
-    """Stamps that start again after ``wrap`` (week, day, counter) made to go on."""
+def unwrap_stamps(values: np.ndarray, wraps_s: float, ticks: float) -> np.ndarray:
+    """Stamps, ``ticks`` a second, that start again after ``wraps_s`` (week, day, counter) made to go on.
+
+    They start again where they fall by more than a half of it, or where the time that is skipped so is below
+    ``SKIPPED_S``: less are rows out of order.
+    """
+    wrap = wraps_s * ticks
     if np.issubdtype(values.dtype, np.integer):
         wrap = int(wrap)
-    turns = np.concatenate(([0], np.cumsum(np.diff(values) < -wrap / 2)))
+    step = np.diff(values)
+    turns = np.concatenate(([0], np.cumsum((step < 0) & ((step < -wrap / 2) | (step + wrap < SKIPPED_S * ticks)))))
     return values + turns * wrap
 
 

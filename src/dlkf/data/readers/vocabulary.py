@@ -94,12 +94,13 @@ SPEEDS += r"|impulse?|odo(?:meter)?|distance|weg)\b|速|オドメータ"
 NO_WHEEL = r"\b(?:gps|gnss|diff\w*|average|avg|mean|max\w*|trip|engine|motor|fan|std|acc\w*|angle|steer\w*|time)\b"
 COUNTED = r"\b(?:ticks?|counts?|pulses?|impulse?|odo(?:meter)?|distance|weg)\b"
 REAR = r"\b(?:rl|rr|rear|hl|hr|hinten|arriere|trasera)\b|后|後"
-HEADING = r"\b(?:hdt|ths|dual|baseline|relpos\w*|antennas?|moving ?base|true ?heading)\b"
+HEADING = r"\b(?:hdt|ths|dual|baseline|relpos\w*|antennas?|moving ?base)\b"  # "true heading" is a phone's compass
+COMPASS = r"\b(?:magn\w*|compass|kompass)\b"
 PRESSURE = r"(?:baro(?:meter|metric)? ?)?(?:air ?)?(?:press(?:ure)?|luftdruck|druck|pression|presion|气压|氣壓|気圧)"
 BARO_HEIGHT = r"baro(?:metric|meter)? ?(?:alt(?:itude)?|height)|relative ?altitude"
 
 TIME = (
-    r"#?(?:t|time|time ?stamp|tow|sow|gps ?(?:time|sow|tow|seconds?|t)?|unix ?(?:time)?|posix(?: ?time)?|utc"
+    r"#?(?:t|time|time ?stamps?|tow|sow|gps ?(?:time|sow|tow|seconds?|t)?|unix ?(?:time)?|posix(?: ?time)?|utc"
     r"|stamp|epoch|secs?|seconds|date ?time|milli(?:s|seconds)?"
     r"|micro(?:s|seconds)?|nano(?:s|seconds)?|ms|us|ns|ticks|sample ?time"
     r"|ros ?time|i ?tow|utc ?(?:time|seconds)|seconds ?elapsed|elapsed|sample ?time ?fine|date ?num"
@@ -109,6 +110,9 @@ TIME = (
     r"|时间戳?|時間|时刻|時刻|タイムスタンプ)(?: (?:utc|gps|unix|local|lokal))*"
 )
 DATE = r"(?:(?:utc|gps|local|gnss) ?)?(?:date|datum|tag|jour|fecha|dia|日期|日付|年月日)(?: (?:utc|gps|local|lokal))?"
+SECONDS = r"(?:s|secs?|seconds?)"
+FRACTIONS = {"ns": rf"n(?:ano)? ?{SECONDS}", "us": rf"(?:u|micro) ?{SECONDS}", "ms": rf"(?:m|milli) ?{SECONDS}"}
+SINCE_1970 = r"(?:location |gps |gnss )?time ?stamp since ?1970"  # of a fix itself, beside samples
 CLOCKS = {"unix": r"\b(unix|posix|epoch|ros)\b", "gps": r"\b(gps|gpst|gnss|tow|sow|itow)\b", "utc": r"\butc\b"}
 
 # units as words (brackets and signs gone): the quantity's unit as the mapping calls it
@@ -210,6 +214,22 @@ def is_wheel(name: str) -> bool:
 def match_columns(names: Iterable[str], pattern: str) -> list[str]:
     """The columns whose words are all of a pattern."""
     return [name for name in names if re.fullmatch(pattern, words(name)) or re.fullmatch(pattern, _plain(name))]
+
+
+def find_fraction(name: str) -> str | None:
+    """The unit of a column with what another one lacks of the seconds, by its last word: ``nsecs``, ``micros``."""
+    return next((unit for unit, said in FRACTIONS.items() if re.search(rf"\b{said}$", _plain(name))), None)
+
+
+def find_seconds(names: Iterable[str]) -> tuple[str, str] | None:
+    """Seconds and the rest of them in two columns: ``stamp.secs``, ``stamp.nsecs``; None where there are none."""
+    bare = {_plain(name): name for name in names}
+    for said, name in bare.items():
+        if (unit := find_fraction(name)) is not None:
+            before = re.sub(rf"\b{FRACTIONS[unit]}$", "", said)
+            if whole := next((n for w, n in bare.items() if re.fullmatch(f"{re.escape(before)}{SECONDS}", w)), None):
+                return whole, name
+    return None
 
 
 def find_triads(names: Sequence[str]) -> dict[str, list[str]]:
