@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 import subprocess
 import sys
 import zipfile
@@ -169,9 +170,7 @@ def write_beijing(logs: Path) -> None:
     for k, (path, _, delay_s, yaw_deg) in enumerate(car_logs.BEIJING.values()):
         file = logs / "yandld/nav_matlab" / path
         file.parent.mkdir(parents=True, exist_ok=True)
-        turn = rotation_from_rpy(torch.tensor([0.0, 0.0, np.radians(yaw_deg)], dtype=torch.float64)).numpy()
-        right_forward_up = np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1]])
-        imu = np.column_stack([BASE_S + t, *np.concatenate(sensed(t, turn @ right_forward_up))])
+        imu = np.column_stack([BASE_S + t, *np.concatenate(sensed(t, turned(yaw_deg, car_logs.RFU)))])
         one, up = np.ones(len(half)), 0.2
         sigma = [1.5 * one, 1.4 * one, 2.5 * one, 0.12 * one, 0.11 * one, up * one]
         gnss = np.column_stack(
@@ -206,6 +205,45 @@ def write_kth(logs: Path) -> None:
     savemat(file, {"dataset": {"gnss": gnss, "imu": {"time": t, "acc": accel, "gyro": gyro}}})
 
 
+def turned(yaw_deg: float, axes: np.ndarray) -> np.ndarray:
+    """What turns a sensor with such axes that stands turned in the car to Forward-Right-Down."""
+    return rotation_from_rpy(torch.tensor([0.0, 0.0, np.radians(yaw_deg)], dtype=torch.float64)).numpy() @ axes
+
+
+def write_boulder(logs: Path) -> None:
+    """Back-Right-Up and turned; the first and the last row of the IMU are cut off; fixes are stamped 0.185 s early."""
+    folder = logs / "rtklibexplorer/GNSS_IMU/data/drive_0708"
+    folder.mkdir(parents=True)
+    t, seconds = np.arange(0.01, END_S, 0.01), np.arange(1.0, END_S - 1, 0.25)
+    accel, gyro = sensed(t, turned(5.5, car_logs.BRU))
+    rows = np.column_stack([*(accel / other_cars.G), *np.degrees(gyro), 5000 + 1e3 * t])
+    np.savetxt(folder / "imu_1934.csv", rows[[0, *range(len(t)), 0]], delimiter=",", fmt="%.9f")
+    pairs = np.array([[0, 0], [round(1e3 * (t[-1] - t[0])), 4711]], "<u4")
+    day = 20_000 * 86400 + int(BASE_S) % 86400
+    (folder / "imu_1934.csv.tag").write_bytes(bytes(64) + struct.pack("<Id", day, 0.01) + pairs.tobytes())
+    (lat, lon), v, still = place(at(seconds, WAY)), at(seconds, SPEED * np.exp(1j * YAW)), 0 * seconds
+    stamps = (pd.Timestamp("2025-07-08") + pd.to_timedelta(BASE_S % 86400 + seconds - 0.185, "s")).strftime(
+        "%H:%M:%S.%f"
+    )
+    columns = [lat, lon, still + 1600, still + 1, still + 20, *[still + 0.01] * 3, *[still] * 5, v.real, v.imag, still]
+    columns += [*[still + 0.05] * 3, *[still] * 3]
+    lines = [f"2025/07/08 {s} {' '.join(f'{x:.9f}' for x in row)}" for s, row in zip(stamps, zip(*columns))]
+    (folder / "gnss_1934_sf.pos").write_text("\n".join(["%  GPST latitude(deg)", *lines]) + "\n")
+
+
+def write_raut(logs: Path) -> None:
+    """Turned in the car; seconds and nanoseconds in two columns, fixes 0.04 s late."""
+    folder = logs / "AkshajRaut/Sensor-Fusion-of-GPS-and-IMU/analysis"
+    t, seconds = np.arange(0.02, END_S, 0.025), np.arange(1.0, END_S - 1)
+    accel, gyro = sensed(t, turned(-4.8, np.eye(3)))
+    imu = {f"{kind}.{axis}": x[k] for kind, x in (("Linear", accel), ("Angular", gyro)) for k, axis in enumerate("xyz")}
+    lat, lon = place(at(seconds, WAY))
+    for name, clock, table in (("imu", t, imu), ("gps", seconds + 0.04, {"Latitude": lat, "Longitude": lon})):
+        nanoseconds = np.round(1e9 * (clock % 1)).astype(int)
+        stamps = {"seconds": (BASE_S + np.floor(clock)).astype(int), "nanoseconds": nanoseconds}
+        write(folder / f"trip_{name}.csv", pd.DataFrame(stamps | table))
+
+
 WRITERS = {
     "nuance": write_nuance,
     "kingston": write_kingston,
@@ -215,6 +253,8 @@ WRITERS = {
     "boston": write_boston,
     "beijing": write_beijing,
     "kth": write_kth,
+    "boulder": write_boulder,
+    "raut": write_raut,
 }
 COUNTS = {"nuance": 2, "boston": 3, "beijing": 3}
 

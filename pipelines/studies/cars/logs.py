@@ -312,16 +312,14 @@ def read_boulder(logs: Path, ahead_s: float = 0.185) -> Iterator[DriveFrames]:
     tags of RTKLIB give the beginning and the end of the IMU's file."""
     folder = logs / "rtklibexplorer/GNSS_IMU/data/drive_0708"
     tag = (folder / "imu_1934.csv.tag").read_bytes()
-    (seconds, fraction), tags = (
-        struct.unpack("<Id", tag[64:76]),
-        np.frombuffer(tag[76 : 8 * (len(tag) // 8) - 4], "<u4"),
-    )
+    (seconds, fraction), last_ms = struct.unpack("<Id", tag[64:76]), np.frombuffer(tag, "<u4", offset=76)[-2]
     rows = np.genfromtxt(folder / "imu_1934.csv", delimiter=",", skip_header=1, skip_footer=1)
     clock = rows[:, 6] - rows[0, 6]
-    t = seconds % 86400 + fraction + clock * (1e-3 * tags[-2] / clock[-1])
+    zero = seconds % 86400
+    t = fraction + clock * (1e-3 * last_ms / clock[-1])
     imu = turn_level(level(imu_table(t, G * rows[:, :3], np.radians(rows[:, 3:6]), BRU)), np.radians(5.5))
     gnss = pd.read_csv(folder / "gnss_1934_sf.pos", sep=r"\s+", skiprows=1, header=None)
-    t_fix = pd.to_timedelta(gnss[1]).dt.total_seconds().to_numpy() + ahead_s
+    t_fix = pd.to_timedelta(gnss[1]).dt.total_seconds().to_numpy() - zero + ahead_s
     columns = {"std_pos": (7, 8, 9), "vel": (15, 16, 17), "std_vel": (18, 19, 20)}
     known = {f"{kind}_{axis}": gnss[k].to_numpy() for kind, places in columns.items() for axis, k in zip("ned", places)}
     quality = gnss[5].astype(int).map({1: 4, 2: 5, 4: 2, 5: 1}).to_numpy()
