@@ -46,7 +46,7 @@ class ScaledFilter(nn.Module):
         return self.kalman.step(memory, epoch._replace(noise=noise))
 
     def tuning(self) -> Tuning:
-        """Settings with which a filter without advice is the same."""
+        """Settings with which a filter without factors is the same."""
         values = dict(zip(FACTORS, self.logarithms.detach().exp().tolist(), strict=True))
         start = self.kalman.tuning
         return replace(start, **{k: v * getattr(start, k) for k, v in values.items()})
